@@ -1,0 +1,1 @@
+"""Making data: body models -> identity x pose grids of meshes -> Zarr shards. Knows nothing of training."""

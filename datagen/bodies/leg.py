@@ -1,0 +1,66 @@
+"""A procedural two-bone leg: a tube from hip to foot that bends at the knee.
+
+It needs no assets and loads at once: for tests, for trying the pipeline out, and as the smallest example of how a
+family is added. Identity: length, thigh and ankle radius, knee height. It obeys ``left_hip`` and ``left_knee``.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datagen.bodies import Asset
+from datagen.bodies.skinning import Rest, skin
+from datagen.poses import JOINTS
+from datagen.recipe import LegBody
+
+_RANGES = {"length": (0.7, 1.1), "thigh_radius": (0.06, 0.14), "ankle_radius": (0.03, 0.06), "knee": (0.45, 0.6)}
+_BONES = ("left_hip", "left_knee")
+
+
+class LegModel:
+    """See :class:`datagen.bodies.BodyModel`; frame: metres, Y up, facing +Z, the hip at the origin."""
+
+    parameter_names = tuple(_RANGES)
+    assets = (Asset("procedural leg", "Apache-2.0", "1"),)
+
+    def __init__(self, recipe: LegBody) -> None:
+        self._rings, self._segments = recipe.rings, recipe.segments
+
+    def draw_identity(self, random: np.random.Generator) -> NDArray[np.float64]:
+        """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
+        return np.array([random.uniform(low, high) for low, high in _RANGES.values()])
+
+    def faces(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Triangles [face, 3] of the tube and its two caps."""
+        ring, step = np.meshgrid(np.arange(self._rings - 1), np.arange(self._segments), indexing="ij")
+        first = (ring * self._segments + step).ravel()
+        right = (ring * self._segments + (step + 1) % self._segments).ravel()
+        side = [np.stack([first, right, first + self._segments], 1)]
+        side.append(np.stack([right, right + self._segments, first + self._segments], 1))
+        fan = np.stack(
+            [np.zeros(self._segments - 2), *np.arange(1, self._segments).reshape(1, -1).repeat(2, 0)[:, :-1]]
+        )
+        fan[2] += 1
+        last = (self._rings - 1) * self._segments
+        return np.concatenate([*side, fan.T[:, ::-1], fan.T + last]).astype(np.int32)
+
+    def vertices(self, parameters: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Vertices [pose, vertex, 3] float32."""
+        chosen = poses[:, [JOINTS.index(bone) for bone in _BONES]]
+        rotations = Rotation.from_rotvec(chosen.reshape(-1, 3)).as_matrix().reshape(len(poses), 2, 3, 3)
+        return skin(self._rest(parameters), rotations)
+
+    def _rest(self, parameters: NDArray[np.float64]) -> Rest:
+        length, thigh, ankle, knee = parameters
+        along = np.linspace(0.0, 1.0, self._rings)
+        angle = np.linspace(0.0, 2 * np.pi, self._segments, endpoint=False)
+        radius = (thigh + (ankle - thigh) * along) * (1 + 0.15 * np.sin(np.pi * along) ** 2)
+        x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle) + 0.02 * np.sin(np.pi * along)[:, None]
+        y = np.broadcast_to(-length * along[:, None], x.shape)
+        shin = np.repeat(1 / (1 + np.exp((knee - along) * 40)), self._segments)
+        return Rest(
+            vertices=np.stack([x, y, z], axis=-1).reshape(-1, 3),
+            joints=np.array([[0.0, 0.0, 0.0], [0.0, -length * knee, 0.0]]),
+            weights=np.stack([1 - shin, shin], axis=1),
+            parents=(-1, 0),
+        )

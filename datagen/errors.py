@@ -1,0 +1,33 @@
+"""One error hierarchy for everything a person can get wrong or a disk can break.
+
+Every message says what is wrong, where, the offending value, and the next command. The command line
+prints it as one line and exits with ``exit_status``; nothing else of the traceback is shown.
+"""
+
+
+class DsffnetError(Exception):
+    """Base of all errors that are a person's business rather than a programmer's."""
+
+    exit_status = 1
+
+
+class RecipeError(DsffnetError):
+    """A recipe or a command line that cannot mean anything (unknown key, wrong type, impossible value)."""
+
+    exit_status = 2
+
+
+class MeshError(DsffnetError):
+    """A mesh file or mesh array that cannot be used (missing, unreadable, empty, not finite, no faces)."""
+
+
+class BodyError(DsffnetError):
+    """A body model that cannot be loaded, or that produced something that is not a mesh."""
+
+
+class DatasetError(DsffnetError):
+    """A dataset that is missing, incomplete, damaged, of another version, or made by another recipe."""
+
+
+class StorageError(DsffnetError):
+    """Files could not be written (full disk, no permission); what was there before is untouched."""

@@ -1,0 +1,149 @@
+"""Meshes: normalisation, edges, and the one place where mesh files are read and written."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.errors import MeshError, StorageError
+
+FORMATS = (".obj", ".ply", ".off", ".glb", ".stl")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Vertices [vertex, 3] and triangles [face, 3] that index them."""
+
+    vertices: NDArray[np.floating]
+    faces: NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Centre [..., 3] and half the longest edge [...] of an axis-aligned bounding box, in the mesh's own unit."""
+
+    centre: NDArray[np.floating]
+    half: NDArray[np.floating]
+
+    def normalise(self, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Mesh coordinates -> the box's coordinates, in [-1, 1]."""
+        return (vertices - self.centre[..., None, :]) / self.half[..., None, None]
+
+    def restore(self, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
+        """The box's coordinates -> mesh coordinates."""
+        return vertices * self.half[..., None, None] + self.centre[..., None, :]
+
+
+def bounding_box(vertices: NDArray[np.floating]) -> Box:
+    """Bounding box of vertices [..., vertex, 3], the normalisation of the DSFFNet paper and of NPT.
+
+    Each mesh is moved so that its box is centred on the origin and divided by half the longest edge of the box.
+    """
+    low, high = vertices.min(axis=-2), vertices.max(axis=-2)
+    return Box((low + high) / 2, (high - low).max(axis=-1) / 2)
+
+
+def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Unique undirected edges [edge, 2] of triangles [face, 3], sorted."""
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.unique(np.sort(sides, axis=1), axis=0).astype(np.int64)
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a mesh file, keeping its vertex order (nothing is merged or reordered).
+
+    Raises
+    ------
+    MeshError
+        The file is missing, of an unknown format, unreadable, or not one usable triangle mesh.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"no mesh file at {path}")
+    if path.suffix.lower() not in FORMATS:
+        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+    return check_mesh(_single_geometry(path), name=str(path))
+
+
+def _single_geometry(path: Path) -> Mesh:
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path, process=False, maintain_order=True)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    except Exception as error:  # trimesh's readers raise whatever their parsers raise
+        raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
+    if len(parts) > 1:
+        raise MeshError(f"{path} holds {len(parts)} separate meshes; save the one to use as a file of its own")
+    if not parts:
+        raise MeshError(f"{path} holds no triangles (a point cloud, or an empty file?)")
+    return Mesh(np.asarray(parts[0].vertices, np.float64), np.asarray(parts[0].faces, np.int64))
+
+
+def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
+    """Return the mesh if it is usable.
+
+    Raises
+    ------
+    MeshError
+        No vertices, no faces, coordinates that are not finite, faces that index nothing, or no extent.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) == 0:
+        raise MeshError(f"{name} has no usable vertices (shape {vertices.shape})")
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) == 0:
+        raise MeshError(f"{name} has no faces (shape {faces.shape}); pose transfer needs a triangle mesh")
+    wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(wrong):
+        raise MeshError(f"{name}: {len(wrong)} vertices are not finite, the first is number {wrong[0]}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{name}: faces name vertex {faces.max()}, but there are {len(vertices)}")
+    if not bounding_box(vertices).half > 0:
+        raise MeshError(f"{name} has no extent: all vertices are at {vertices[0].tolist()}")
+    return mesh
+
+
+def save_mesh(mesh: Mesh, path: str | Path) -> None:
+    """Write a mesh; the format is the file name's. The file appears whole or not at all.
+
+    Raises
+    ------
+    MeshError
+        Unknown format.
+    StorageError
+        The file could not be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+    import trimesh
+
+    exported: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=path.suffix[1:].lower())
+    write_atomically(path, exported.encode() if isinstance(exported, str) else exported)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all, creating its folder.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, or the place cannot be written to.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as error:
+        raise StorageError(f"could not write {path}: {error.strerror or error}") from error

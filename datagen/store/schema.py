@@ -1,0 +1,149 @@
+"""Names, shapes, codecs and attributes of a dataset: the contract between datagen and training.
+
+NAME.zarr                     status building|complete, recipe, splits, provenance, statistics (attributes)
+  topology/T/faces            (face, 3) int32
+  identity/I/vertices         (row, vertex, 3) float32, metres, Y up; chunk = one mesh, shard = many rows
+  identity/I/pose             (row,) int32, the pose number of each row
+  identity/I/parameters       (parameter,) float64, what the body model needs to make this identity again
+  pose/parameters             (pose, joint, 3) float64, axis-angle in radians
+  evaluation/seen, /unseen    (triple, 4) int32: source identity, source pose, target identity, target pose
+  manifest                    one row a shard: path, rows, sha256 (attributes); committed last
+"""
+
+import asyncio
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.core.sync import sync
+
+from datagen.errors import DatasetError
+from datagen.grid import Shard
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, order=True)
+class ManifestRow:
+    """One shard file: where it lies, how many meshes it holds, the hash of its bytes, and the extent of its meshes."""
+
+    path: str
+    rows: int
+    sha256: str
+    bytes: int
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, row: dict[str, Any]) -> "ManifestRow":
+        return cls(**{**row, "minimum": tuple(row["minimum"]), "maximum": tuple(row["maximum"])})
+
+
+def identity_name(identity: int) -> str:
+    """Group name of identity number ``identity``."""
+    return f"{identity:04d}"
+
+
+def vertices_path(identity: int) -> str:
+    """Path of the vertices array of an identity within the dataset."""
+    return f"identity/{identity_name(identity)}/vertices"
+
+
+def shard_path(shard: Shard) -> str:
+    """Path of a shard's file within the dataset."""
+    return f"{vertices_path(shard.identity)}/c/{shard.number}/0/0"
+
+
+def create_vertices_array(group: zarr.Group, path: str, *, rows: int, vertices: int, shard: int, level: int) -> None:
+    """An empty array (row, vertex, 3): NaN fill, one mesh a chunk, Blosc-zstd-shuffle then crc32c inside each shard."""
+    chunk = (1, vertices, 3)
+    codec = ShardingCodec(
+        chunk_shape=chunk,
+        codecs=[BytesCodec(), BloscCodec(cname="zstd", clevel=level, shuffle="shuffle", typesize=4), Crc32cCodec()],
+        index_codecs=[BytesCodec(), Crc32cCodec()],
+    )
+    group.create_array(
+        path,
+        shape=(rows, vertices, 3),
+        dtype="float32",
+        chunks=(min(shard, rows), vertices, 3),
+        serializer=codec,
+        compressors=None,
+        filters=None,
+        fill_value=np.nan,
+        dimension_names=("row", "vertex", "coordinate"),
+    )
+
+
+def array_at(group: zarr.Group, path: str) -> zarr.Array[Any]:
+    """The array at ``path``; KeyError where there is none."""
+    found = group[path]
+    if not isinstance(found, zarr.Array):
+        raise KeyError(path)
+    return found
+
+
+def attributes_of(group: zarr.Group) -> dict[str, Any]:
+    """Attributes of a group as a plain dictionary."""
+    return dict(group.attrs.asdict())
+
+
+def read_bytes(group: zarr.Group, path: str) -> bytes | None:
+    """Raw bytes of one object of the dataset's store, or None where there is none."""
+    from zarr.core.buffer import default_buffer_prototype
+
+    key = f"{group.path}/{path}" if group.path else path
+    found = sync(group.store.get(key, default_buffer_prototype()))
+    return None if found is None else found.to_bytes()
+
+
+def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
+    """Size in bytes of each path that exists, asked for concurrently."""
+
+    async def size(path: str) -> tuple[str, int] | None:
+        try:
+            return path, await group.store.getsize(f"{group.path}/{path}" if group.path else path)
+        except FileNotFoundError:
+            return None
+
+    async def sizes() -> list[tuple[str, int] | None]:
+        return list(await asyncio.gather(*(size(path) for path in paths)))
+
+    return dict(found for found in sync(sizes()) if found is not None)
+
+
+def open_group(url: str, *, mode: str = "r") -> zarr.Group:
+    """The root group of a dataset.
+
+    Raises
+    ------
+    DatasetError
+        There is no dataset at ``url``, or its metadata cannot be read.
+    """
+    try:
+        return zarr.open_group(url, mode=mode, zarr_format=3)  # type: ignore[arg-type]
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}"
+        ) from error
+    except (ValueError, KeyError, OSError) as error:
+        raise DatasetError(
+            f"{url} is not a readable dataset ({error}). Make it anew: dsffnet generate ... --fresh"
+        ) from error
+
+
+def check_version(url: str, group: zarr.Group) -> None:
+    """Refuse what this version cannot read, in both directions, saying what to do."""
+    found = attributes_of(group).get("format_version")
+    if found == FORMAT_VERSION:
+        return
+    if found is None:
+        raise DatasetError(f"{url} is a Zarr group but not a dataset of this project (no format_version attribute)")
+    newer = isinstance(found, int) and found > FORMAT_VERSION
+    advice = "update the project" if newer else "make it again: dsffnet generate --recipe RECIPE --out NEW.zarr"
+    raise DatasetError(f"{url} has format version {found!r}, this program reads {FORMAT_VERSION}; {advice}")

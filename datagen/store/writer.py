@@ -1,0 +1,236 @@
+"""Writing a dataset: begin (metadata, idempotent), one whole shard at a time, finish (manifest and status last).
+
+Every step can be repeated after any interruption and leaves the same bytes: arrays are created only where they are
+missing, a shard is written once and whole by one task, and ``status: complete`` is the very last write.
+"""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import subprocess
+import uuid
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numcodecs.blosc
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import ZstdCodec
+
+from datagen.bodies import BodyModel
+from datagen.errors import DatasetError, StorageError
+from datagen.grid import Grid, Shard
+from datagen.poses import JOINTS, draw_poses
+from datagen.random import Stream, generator
+from datagen.recipe import DatasetRecipe
+from datagen.store.schema import (
+    FORMAT_VERSION,
+    ManifestRow,
+    array_at,
+    attributes_of,
+    check_version,
+    create_vertices_array,
+    identity_name,
+    open_group,
+    read_bytes,
+    shard_path,
+    vertices_path,
+)
+
+# Blosc's threads write their blocks in the order in which they finish; one thread makes the bytes reproducible.
+numcodecs.blosc.use_threads = False
+
+_NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
+_PACKAGES = ("anny", "numpy", "scipy", "zarr", "numcodecs")
+
+
+def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
+    """Parameters [parameter] of identity number ``identity``, a function of (seed, identity) alone."""
+    return body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, identity))
+
+
+def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
+    """Create the dataset, or whatever an interrupted ``begin`` left out of it.
+
+    Raises
+    ------
+    DatasetError
+        A dataset of another recipe or version is there already.
+    """
+    with _writing(url):
+        group = open_group(url, mode="a")
+        if "format_version" in group.attrs:
+            _check_same_recipe(url, group, recipe)
+        else:
+            group.attrs.update(_attributes(recipe, body))
+        _create_arrays(group, recipe, body)
+
+
+def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
+    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
+    with _writing(url):
+        group = open_group(url, mode="r+")
+        array = array_at(group, vertices_path(shard.identity))
+        array[shard.start : shard.stop] = vertices
+    row = existing_shard(url, shard)
+    if row is None:
+        raise DatasetError(f"{url}: shard {shard_path(shard)} did not read back as it was written; is the disk sound?")
+    return row
+
+
+def existing_shard(url: str, shard: Shard) -> ManifestRow | None:
+    """The manifest row of a shard that is there, whole and sound; None where it is missing or damaged."""
+    group = open_group(url)
+    raw = read_bytes(group, shard_path(shard))
+    if raw is None:
+        return None
+    try:
+        vertices = np.asarray(array_at(group, vertices_path(shard.identity))[shard.start : shard.stop])
+    except (RuntimeError, ValueError, OSError):  # checksum, codec or index errors of a damaged shard
+        return None
+    if not np.isfinite(vertices).all():
+        return None
+    low, high = (bound(vertices, axis=(0, 1)).astype(float).tolist() for bound in (np.min, np.max))
+    return ManifestRow(
+        shard_path(shard), shard.rows, hashlib.sha256(raw).hexdigest(), len(raw), tuple(low), tuple(high)
+    )
+
+
+def finish(url: str, rows: Sequence[ManifestRow]) -> None:
+    """Commit the manifest, then the statistics, then ``status: complete``."""
+    ordered = sorted(rows)
+    with _writing(url):
+        group = open_group(url, mode="r+")
+        group.require_group("manifest").attrs["shards"] = [row.as_json() for row in ordered]
+        digest = hashlib.sha256("\n".join(row.sha256 for row in ordered).encode()).hexdigest()
+        statistics = {
+            "meshes": sum(row.rows for row in ordered),
+            "bytes": sum(row.bytes for row in ordered),
+            "minimum": np.min([row.minimum for row in ordered], axis=0).tolist(),
+            "maximum": np.max([row.maximum for row in ordered], axis=0).tolist(),
+        }
+        group.attrs.update({"statistics": statistics, "manifest_sha256": digest, "status": "complete"})
+
+
+def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
+    grid, digest = Grid(recipe), recipe.sha256()
+    assets = [vars(asset) for asset in body.assets]
+    return {
+        "format_version": FORMAT_VERSION,
+        "uuid": str(uuid.uuid5(_NAMESPACE, f"{FORMAT_VERSION} {digest} {assets}")),
+        "status": "building",
+        "recipe": recipe.model_dump(mode="json"),
+        "recipe_sha256": digest,
+        "body": {"family": recipe.body.family, "assets": assets, "parameters": list(body.parameter_names)},
+        "provenance": {"packages": _versions(), "git_commit": _git_commit()},
+        "units": "metres",
+        "frame": "Y up, facing +Z, +X to the body's left",
+        "joints": list(JOINTS),
+        "splits": {
+            "identities": {identity_name(i): grid.split(i) for i in range(grid.identity_count)},
+            "poses": {"seen": [0, recipe.poses.seen], "unseen": [recipe.poses.seen, grid.pose_count]},
+        },
+    }
+
+
+def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
+    grid = Grid(recipe)
+    _put(group, "pose/parameters", draw_poses(recipe.poses, range(grid.pose_count)), ("pose", "joint", "axis"))
+    for pose_type in ("seen", "unseen"):
+        _put(group, f"evaluation/{pose_type}", grid.evaluation_triples(pose_type), ("triple", "column"))
+    topologies: dict[bytes, str] = {}
+    for identity in range(grid.identity_count):
+        parameters = identity_parameters(recipe, body, identity)
+        faces = body.faces(parameters)
+        topology = topologies.setdefault(faces.tobytes(), str(len(topologies)))
+        _put(group, f"topology/{topology}/faces", faces, ("face", "corner"))
+        _create_identity(group, grid, identity, parameters, int(faces.max()) + 1, topology)
+
+
+def _create_identity(
+    group: zarr.Group, grid: Grid, identity: int, parameters: NDArray[np.float64], vertices: int, topology: str
+) -> None:
+    home, poses = f"identity/{identity_name(identity)}", grid.poses_of(identity)
+    _put(group, f"{home}/parameters", parameters, ("parameter",))
+    _put(group, f"{home}/pose", np.arange(poses.start, poses.stop, dtype=np.int32), ("row",))
+    if vertices_path(identity) not in group:
+        store = grid.recipe.store
+        create_vertices_array(
+            group,
+            vertices_path(identity),
+            rows=len(poses),
+            vertices=vertices,
+            shard=store.poses_per_shard,
+            level=store.compression_level,
+        )
+    group.require_group(home).attrs.update({"topology": topology, "split": grid.split(identity)})
+
+
+def _put(group: zarr.Group, path: str, values: NDArray[Any], dimensions: tuple[str, ...]) -> None:
+    """Store a small array in one chunk with a checksum, unless it is there and holds these values already."""
+    if _holds(group, path, values):
+        return
+    array = group.create_array(
+        path,
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=tuple(max(1, size) for size in values.shape),
+        compressors=ZstdCodec(level=3, checksum=True),
+        dimension_names=dimensions,
+        overwrite=True,
+    )
+    array[...] = values
+
+
+def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
+    try:
+        return np.array_equal(np.asarray(array_at(group, path)[...]), values)
+    except (KeyError, RuntimeError, ValueError, OSError):
+        return False
+
+
+def _check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
+    check_version(url, group)
+    attributes = attributes_of(group)
+    if attributes["recipe_sha256"] == recipe.sha256():
+        return
+    stored = DatasetRecipe.model_validate(attributes["recipe"])
+    changed = ", ".join(_differences(stored.model_dump(mode="json"), recipe.model_dump(mode="json")))
+    raise DatasetError(
+        f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"
+    )
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "data") -> Iterator[str]:
+    for key in sorted(old.keys() | new.keys()):
+        before, after = old.get(key), new.get(key)
+        if isinstance(before, dict) and isinstance(after, dict):
+            yield from _differences(before, after, f"{prefix}.{key}")
+        elif before != after:
+            yield f"{prefix}.{key}: {before} there, {after} here"
+
+
+@contextlib.contextmanager
+def _writing(url: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(
+            f"could not write to {url}: {error.strerror or error}. What was complete is untouched; "
+            "make room or choose another --out, then run the same command again"
+        ) from error
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in _PACKAGES}
+
+
+def _git_commit() -> str:
+    """Commit of the working tree this code runs from, or 'unknown' (an installed copy, a submitted job)."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
