@@ -89,8 +89,7 @@ class AnnyModel:
         rotations = np.tile(np.eye(3), (len(poses), len(self._bones), 1, 1))
         for joint, name in enumerate(JOINTS):
             matrices = Rotation.from_rotvec(poses[:, joint]).as_matrix()
-            for bone in rig_joints(name):
-                rotations[:, self._bones.index(bone)] = matrices
+            rotations[:, [self._bones.index(bone) for bone in rig_joints(name)]] = matrices[:, None]
         for bone, parent in enumerate(self._parents):
             before = np.eye(3) if parent < 0 else self._correction[parent].T
             rotations[:, bone] = before @ rotations[:, bone] @ self._correction[bone]

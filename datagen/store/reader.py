@@ -15,6 +15,7 @@ from datagen.recipe import DatasetRecipe
 from datagen.store.schema import (
     ManifestRow,
     array_at,
+    attributes_of,
     check_version,
     identity_name,
     open_group,
