@@ -1,0 +1,163 @@
+"""The page holds the meshes to the stated precision, loads nothing, and shows hostile names as plain text."""
+
+import base64
+import json
+import re
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from training.figures import ErrorScale, TransferExample, placed
+from training.rendering import Floats, Integers
+from training.viewer import decode_positions, viewer_payload, write_viewer
+
+HOSTILE = "</script><img src=x onerror=alert(1)><!-- <script> ${title} &amp; \u2028 '\""
+
+
+@dataclass
+class Named:
+    vertices: Floats
+    faces: Integers
+    name: str = ""
+
+
+def examples(count: int = 2, name: str = "body") -> list[TransferExample]:
+    random = np.random.default_rng(0)
+    faces = random.integers(0, 50, (80, 3))
+    up = np.array([0.0, 1, 0])
+    made = []
+    for index in range(count):
+        truth = random.normal(size=(50, 3)) + 5
+        roles = [random.normal(size=(50, 3)), random.normal(size=(50, 3)), truth + 0.01 * (index + 1) * up, truth]
+        source, target, output, right = (Named(one, faces, name) for one in roles)
+        made.append(TransferExample(f"{name} {index}", source, target, output, right, name))
+    return made
+
+
+class Elements(HTMLParser):
+    """Collects elements and the text of the data script, as a browser would meet them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[str, str] = {}
+        self.data = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        tag, attributes = self.elements[-1] if self.elements else ("", {})
+        self.texts[tag] = self.texts.get(tag, "") + data
+        if attributes.get("id") == "data":
+            self.data += data
+
+
+def parsed(path: Path) -> Elements:
+    elements = Elements()
+    elements.feed(path.read_text(encoding="utf-8"))
+    return elements
+
+
+def page_data(path: Path) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads(parsed(path).data.strip())
+    return data
+
+
+def test_positions_decode_to_within_half_a_step(tmp_path: Path) -> None:
+    originals = examples()
+    data = page_data(write_viewer(originals, tmp_path / "viewer.html", title="t"))
+    for original, embedded in zip(originals, data["examples"], strict=True):
+        for role, vertices in placed(original).items():
+            mesh = embedded["meshes"][role]
+            half_step = np.ptp(vertices, axis=0) / 65535 / 2
+            assert (np.abs(decode_positions(mesh) - vertices) <= half_step * (1 + 1e-6) + 1e-12).all()
+
+
+def test_triangles_are_exact_and_kept_once(tmp_path: Path) -> None:
+    originals = examples()
+    data = page_data(write_viewer(originals, tmp_path / "viewer.html", title="t"))
+    assert len(data["faces"]) == 1
+    kept = data["faces"][data["examples"][1]["meshes"]["truth"]["faces"]]
+    assert kept["kind"] == "uint16"
+    indices = np.frombuffer(base64.b64decode(kept["indices"]), "<u2").reshape(-1, 3)
+    assert (indices == originals[0].truth.faces).all()
+
+
+def test_many_vertices_take_wider_indices() -> None:
+    vertices = np.random.default_rng(0).normal(size=(65536, 3))
+    mesh = Named(vertices, np.array([[0, 1, 65535]]))
+    payload = viewer_payload([TransferExample("big", mesh, mesh, mesh, mesh)], error_scale=ErrorScale())
+    (kept,) = payload["faces"].values()
+    assert kept["kind"] == "uint32" and np.frombuffer(base64.b64decode(kept["indices"]), "<u4").tolist() == [
+        0,
+        1,
+        65535,
+    ]
+
+
+def test_errors_are_in_the_unit_of_the_bar_and_share_its_limit(tmp_path: Path) -> None:
+    data = page_data(write_viewer(examples(), tmp_path / "viewer.html", title="t"))
+    errors = [np.frombuffer(base64.b64decode(example["errors"]), "<f4") for example in data["examples"]]
+    assert errors[0] == pytest.approx(1.0, rel=1e-5) and errors[1] == pytest.approx(2.0, rel=1e-5)
+    assert data["error"]["unit"] == "cm" and data["error"]["limit"] == pytest.approx(2.0)
+    assert data["examples"][1]["error_text"] == "mean 2, largest 2 cm"
+
+
+def test_the_page_loads_nothing(tmp_path: Path) -> None:
+    elements = parsed(write_viewer(examples(), tmp_path / "viewer.html", title="t")).elements
+    for _, attributes in elements:
+        assert not {"src", "href", "srcset", "action", "poster"} & set(attributes)
+    policy = next(a["content"] for _, a in elements if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy is not None and policy.startswith("default-src 'none'") and "http" not in policy
+    assert not re.search(r"url\(|@import", (files("training") / "assets" / "viewer.css").read_text())
+
+
+def test_hostile_names_are_inert(tmp_path: Path) -> None:
+    page = parsed(write_viewer(examples(1, HOSTILE), tmp_path / "viewer.html", title=HOSTILE))
+    tags = [tag for tag, _ in page.elements]
+    assert tags.count("script") == 2 and "img" not in tags
+    assert HOSTILE in page.texts["title"] and HOSTILE in page.texts["h1"]
+    data = json.loads(page.data.strip())
+    assert data["examples"][0]["title"] == f"{HOSTILE} 0" and data["examples"][0]["metrics"] == HOSTILE
+    assert data["examples"][0]["meshes"]["source"]["name"] == HOSTILE
+
+
+def test_the_bundle_can_stand_in_a_page_and_carries_its_licence(tmp_path: Path) -> None:
+    assets = files("training") / "assets"
+    bundle = (assets / "viewer.bundle.js").read_text(encoding="utf-8")
+    assert len(bundle) < 800_000 and not re.search(r"</script|<!--", bundle, re.IGNORECASE)
+    licence = (assets / "THREE-LICENSE.txt").read_text(encoding="utf-8")
+    assert "MIT License" in licence and "three.js authors" in licence
+    assert licence in write_viewer(examples(), tmp_path / "viewer.html", title="t").read_text(encoding="utf-8")
+    assert "innerHTML" not in (assets / "viewer.js").read_text(encoding="utf-8")
+
+
+def test_pinned_versions_agree() -> None:
+    assets = files("training") / "assets"
+    pinned = json.loads((assets / "package.json").read_text(encoding="utf-8"))["devDependencies"]
+    heading = (assets / "viewer.js").read_text(encoding="utf-8").splitlines()[0]
+    assert f"three {pinned['three']}" in heading and f"esbuild {pinned['esbuild']}" in heading
+    assert f'"{pinned["three"].split(".")[1]}"' in (assets / "viewer.bundle.js").read_text(encoding="utf-8")
+
+
+def test_page_and_script_agree_on_names() -> None:
+    assets = files("training") / "assets"
+    script, page = ((assets / name).read_text(encoding="utf-8") for name in ("viewer.js", "viewer.html"))
+    wanted = set(re.findall(r'find\("(\w+)"\)', script))
+    assert wanted and wanted <= set(re.findall(r'id="(\w+)"', page))
+
+
+def test_nothing_to_show_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        write_viewer([], tmp_path / "viewer.html", title="t")
+    broken = examples(1)
+    broken[0].output.vertices[0] = np.inf
+    with pytest.raises(ValueError, match="1 of 50 vertices of the output are not finite"):
+        write_viewer(broken, tmp_path / "viewer.html", title="t")
+    assert not list(tmp_path.iterdir())

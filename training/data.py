@@ -1,0 +1,117 @@
+"""Dataset -> decoded bank of normalised meshes -> batches of triples, a function of (seed, epoch, index).
+
+A training triple is (source, target, truth): truth = (target's identity, source's pose); source and target differ in
+identity and in pose (REFERENCE: DSFFNet, section 4.1). One epoch shows every cell of the training grid once as truth.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datagen.errors import DatasetError
+from datagen.mesh import bounding_box, edges_of
+from datagen.random import Stream, generator
+from datagen.store import Dataset
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Normalised vertices [batch, vertex, 3] of the three meshes of each triple."""
+
+    source: Tensor
+    target: Tensor
+    truth: Tensor
+
+
+class VertexBank:
+    """Every mesh of some identities, each normalised to its own bounding box, decoded once and kept on one device.
+
+    Meshes are float32 [vertex, 3] in [-1, 1]. All identities must share one topology.
+    """
+
+    def __init__(self, dataset: Dataset, identities: Sequence[int], *, device: torch.device | str = "cpu") -> None:
+        faces = {dataset.faces(identity).tobytes() for identity in identities}
+        if len(faces) > 1:
+            raise DatasetError(
+                f"{dataset.url} mixes {len(faces)} topologies; batches need one. Train on identities of one topology"
+            )
+        self.faces = dataset.faces(identities[0])
+        self.edges = torch.from_numpy(edges_of(self.faces)).to(device)
+        self._first: dict[int, int] = {}
+        meshes, rows = [], 0
+        for identity in identities:
+            vertices = dataset.vertices(identity)
+            self._first[identity] = rows
+            rows += len(vertices)
+            meshes.append(torch.from_numpy(bounding_box(vertices).normalise(vertices).astype(np.float32)))
+        self._meshes = torch.cat(meshes).to(device)
+
+    def __len__(self) -> int:
+        return len(self._meshes)
+
+    def gather(self, identities: NDArray[np.integer], poses: NDArray[np.integer]) -> Tensor:
+        """Normalised vertices [batch, vertex, 3] of the cells (identity, pose)."""
+        rows = np.array([self._first[int(identity)] for identity in identities]) + poses
+        return self._meshes[torch.from_numpy(rows).to(self._meshes.device)]
+
+    def batch(self, triples: NDArray[np.integer]) -> Batch:
+        """The meshes of rows (source identity, source pose, target identity, target pose)."""
+        source_identity, source_pose, target_identity, target_pose = triples.T
+        return Batch(
+            source=self.gather(source_identity, source_pose),
+            target=self.gather(target_identity, target_pose),
+            truth=self.gather(target_identity, source_pose),
+        )
+
+
+def epoch_triples(*, identities: int, poses: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    """All triples of an epoch in their order: rows (source identity, source pose, target identity, target pose).
+
+    A pure function of its arguments; identities are numbered within the training split. Row order is a random
+    permutation of the grid's cells, each cell (target identity, source pose) being the truth once.
+    """
+    random = generator(seed, Stream.TRAINING_TRIPLES, epoch)
+    target, source_pose = np.divmod(random.permutation(identities * poses), poses)
+    source = (target + random.integers(1, identities, len(target))) % identities
+    target_pose = (source_pose + random.integers(1, poses, len(target))) % poses
+    return np.stack([source, source_pose, target, target_pose], axis=1)
+
+
+@dataclass(frozen=True)
+class TripleOrder:
+    """The order of training triples over a whole run, the same for any number of ranks."""
+
+    identities: Sequence[int]
+    poses: int
+    batch: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.steps_per_epoch == 0:
+            raise DatasetError(f"the training grid has {self.cells} cells, fewer than a batch of {self.batch}")
+
+    @property
+    def cells(self) -> int:
+        return len(self.identities) * self.poses
+
+    @property
+    def steps_per_epoch(self) -> int:
+        return self.cells // self.batch
+
+    def batches(self, *, first_step: int, rank: int = 0, ranks: int = 1) -> Iterator[NDArray[np.int64]]:
+        """This rank's share of every batch from ``first_step`` on, without end."""
+        numbers = np.asarray(self.identities)
+        share = self.batch // ranks
+        step = first_step
+        while True:
+            epoch = step // self.steps_per_epoch
+            triples = epoch_triples(identities=len(numbers), poses=self.poses, seed=self.seed, epoch=epoch)
+            triples[:, [0, 2]] = numbers[triples[:, [0, 2]]]
+            for place in range(step % self.steps_per_epoch, self.steps_per_epoch):
+                start = place * self.batch + rank * share
+                yield triples[start : start + share]
+                step += 1

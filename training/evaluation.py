@@ -1,0 +1,143 @@
+"""Rows (one a triple: who, which pose, every metric) for the trained network and for the two no-op baselines.
+
+The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
+(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from datagen.grid import PoseType
+from datagen.mesh import bounding_box, write_atomically
+from datagen.store import Dataset, open_dataset
+from training import metrics
+from training.data import VertexBank
+from training.inference import load_trained, predict
+from training.recipe import EvaluationRecipe
+
+NO_OPS = ("target unchanged", "source unchanged")
+POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
+Runner = Callable[[Callable[..., Any], list[tuple[Any, ...]]], Iterator[Any]]
+
+
+@dataclass(frozen=True, order=True)
+class Row:
+    """One method on one evaluation triple. Metrics are in the normalised box unless their name says otherwise."""
+
+    method: str
+    pose_type: str
+    triple: int
+    source_identity: int
+    source_pose: int
+    target_identity: int
+    target_pose: int
+    pmd: float
+    pmd_recentred: float
+    chamfer: float
+    earth_mover: float
+    millimetres: float
+    edge_ratio: float
+    normal_degrees: float
+
+
+def evaluation_list(dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType) -> np.ndarray[Any, Any]:
+    """The first ``recipe.triples`` of the dataset's fixed list."""
+    return dataset.evaluation_triples(pose_type)[: recipe.triples]
+
+
+def evaluate(
+    run: Path,
+    data: str,
+    recipe: EvaluationRecipe,
+    *,
+    tasks: Runner,
+    method: str = "DSFFNet",
+    progress: Callable[[Iterable[list[Row]], int], Iterable[list[Row]]] = lambda rows, total: rows,
+) -> list[Row]:
+    """Measure a run on a dataset's fixed evaluation triples; rows come back in a fixed order.
+
+    ``tasks`` runs functions over argument tuples here or on a cluster (see ``datagen.generate``).
+    """
+    dataset = open_dataset(data)
+    arguments = [
+        (str(run), data, recipe, method, pose_type, start)
+        for pose_type in POSE_TYPES
+        for start in range(0, len(evaluation_list(dataset, recipe, pose_type)), recipe.chunk)
+    ]
+    chunks = progress(tasks(measure_chunk, arguments), len(arguments))
+    return sorted(row for chunk in chunks for row in chunk)
+
+
+def measure_chunk(
+    run: str, data: str, recipe: EvaluationRecipe, method: str, pose_type: PoseType, start: int
+) -> list[Row]:
+    """Rows of the triples [start, start + recipe.chunk) of one list, for the network and the no-op baselines."""
+    torch.set_num_threads(max(1, torch.get_num_threads()))
+    dataset, bank, network = _loaded(run, data)
+    triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
+    batch = bank.batch(triples)
+    outputs = {method: predict(network, batch), NO_OPS[0]: batch.target}
+    if batch.source.shape == batch.truth.shape:
+        outputs[NO_OPS[1]] = batch.source
+    half = torch.tensor([_half_size(dataset, int(t[2]), int(t[1])) for t in triples])
+    return [
+        Row(name, pose_type, start + place, *map(int, triple), *values)
+        for name, output in outputs.items()
+        for place, (triple, values) in enumerate(
+            zip(triples, _measure(output, batch.truth, bank, half, recipe), strict=True)
+        )
+    ]
+
+
+def _measure(
+    output: Tensor, truth: Tensor, bank: VertexBank, half: Tensor, recipe: EvaluationRecipe
+) -> list[tuple[float, ...]]:
+    faces = torch.from_numpy(bank.faces).long()
+    columns = (
+        metrics.point_mesh_distance(output, truth),
+        metrics.recentred_point_mesh_distance(output, truth),
+        metrics.chamfer_distance(output, truth),
+        metrics.earth_mover_distance(output, truth, points=recipe.emd_points, seed=recipe.seed),
+        metrics.mean_euclidean_error(output, truth) * half * 1000,
+        metrics.edge_length_ratio_error(output, truth, bank.edges),
+        metrics.normal_angle_error(output, truth, faces),
+    )
+    return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _half_size(dataset: Dataset, identity: int, pose: int) -> float:
+    """Metres that one unit of the normalised box is, for one mesh."""
+    return float(bounding_box(dataset.vertices(identity, pose)).half)
+
+
+@lru_cache(maxsize=1)
+def _loaded(run: str, data: str) -> tuple[Dataset, VertexBank, nn.Module]:
+    dataset = open_dataset(data)
+    return dataset, VertexBank(dataset, dataset.identities("evaluation")), load_trained(Path(run))[0]
+
+
+def write_rows(rows: list[Row], path: Path) -> None:
+    """Write rows as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [field.name for field in fields(Row)])
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows of a CSV that :func:`write_rows` wrote."""
+    with open(path, encoding="utf-8") as file:
+        return [
+            Row(**{field.name: field.type(line[field.name]) for field in fields(Row)})  # type: ignore[operator]
+            for line in csv.DictReader(file)
+        ]

@@ -1,0 +1,63 @@
+"""The truth about a run: one JSON object a line, appended by rank 0, read by whoever shows or mirrors it.
+
+Training is a pure function of its recipe, so a resumed run would write the same lines again for the steps since its
+checkpoint; the journal drops those, and there are neither gaps nor duplicates.
+"""
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+
+class Journal:
+    """Append-only writer of RUN/metrics.jsonl."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _drop_torn_line(path)
+        self._last = max((row["step"] for row in read_journal(path)), default=-1)
+        self._file = open(path, "a", buffering=1, encoding="utf-8")  # noqa: SIM115 - open for the whole run
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Append one line; steps that are in the journal already are dropped."""
+        if step <= self._last:
+            return
+        self._last = step
+        self._file.write(json.dumps({"step": step, "time": time.time(), **values}) + "\n")
+
+    @property
+    def next_step(self) -> int:
+        """The first step that is not in the journal."""
+        return self._last + 1
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def read_journal(path: Path) -> list[dict[str, Any]]:
+    """All whole lines of a journal; an empty list where there is none."""
+    return [row for _, row in journal_from(path, 0)]
+
+
+def journal_from(path: Path, offset: int) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Whole lines from byte ``offset`` on, each with the offset just behind it."""
+    if not path.exists():
+        return
+    with open(path, "rb") as file:
+        file.seek(offset)
+        for line in file:
+            if not line.endswith(b"\n"):
+                return
+            offset += len(line)
+            yield offset, json.loads(line)
+
+
+def _drop_torn_line(path: Path) -> None:
+    if path.exists():
+        content = path.read_bytes()
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            with open(path, "r+b") as file:
+                file.truncate(whole)

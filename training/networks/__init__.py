@@ -1,0 +1,42 @@
+"""The networks by name. Adding one is a file of this folder and a line of `NETWORKS`."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any
+
+from torch import nn
+
+from training.networks.dsffnet import DSFFNet
+
+NETWORKS: dict[str, Callable[..., nn.Module]] = {
+    "dsffnet": DSFFNet,
+}
+"""Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both."""
+
+
+def build_network(name: str, **options: Any) -> nn.Module:
+    """Return a new network.
+
+    Parameters
+    ----------
+    name
+        A key of `NETWORKS`.
+    **options
+        Keyword arguments of its constructor.
+
+    Raises
+    ------
+    ValueError
+        If there is no network of that name.
+
+    Examples
+    --------
+    >>> build_network("dsffnet", encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).training
+    True
+    """
+    if name not in NETWORKS:
+        nearest = difflib.get_close_matches(name, NETWORKS, n=1, cutoff=0.0)[0]
+        raise ValueError(f"unknown network {name!r}; did you mean {nearest!r}? Known: {', '.join(sorted(NETWORKS))}")
+    return NETWORKS[name](**options)

@@ -1,0 +1,107 @@
+"""What a stage tells the tracking server, kept in a folder of its own first, so that no outage loses anything.
+
+FOLDER/record.json: name, kind, parent, parameters, dataset, status, times, artifacts, model. FOLDER/*.jsonl: metrics.
+:mod:`training.tracking` mirrors such folders to MLflow and can be repeated at any time.
+"""
+
+import json
+import os
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from datagen.mesh import write_atomically
+
+Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+FILE = "record.json"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One run as MLflow will show it. ``parent`` and ``artifacts`` are paths relative to the record's folder."""
+
+    name: str
+    kind: str
+    parent: str | None = None
+    parameters: dict[str, str] = field(default_factory=dict)
+    tags: dict[str, str] = field(default_factory=dict)
+    dataset: dict[str, str] | None = None
+    artifacts: list[str] = field(default_factory=list)
+    model: str | None = None
+    metrics: dict[str, float] = field(default_factory=dict)
+    status: Status = "RUNNING"
+    started: int = 0
+    ended: int | None = None
+
+
+def read_record(folder: Path) -> Record | None:
+    """The record of a folder, None where there is none."""
+    path = folder / FILE
+    return Record(**json.loads(path.read_text())) if path.exists() else None
+
+
+def write_record(folder: Path, record: Record) -> None:
+    """Write a record; it appears whole or not at all."""
+    write_atomically(folder / FILE, json.dumps(asdict(record), indent=1).encode())
+
+
+def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, parameters: dict[str, str]) -> Record:
+    """Begin a record, or go on with the one that is there (its start time stays)."""
+    before = read_record(folder)
+    record = Record(
+        name=name,
+        kind=kind,
+        parent=os.path.relpath(parent, folder) if parent else None,
+        parameters=parameters,
+        started=before.started if before else _now(),
+    )
+    write_record(folder, record)
+    return record
+
+
+def update_record(folder: Path, **changes: Any) -> None:
+    """Change fields of the record that is there."""
+    record = read_record(folder)
+    assert record is not None, f"{folder} has no record to update"
+    write_record(folder, replace(record, **changes))
+
+
+def end_record(folder: Path, status: Status) -> None:
+    """Mark a record as ended now."""
+    update_record(folder, status=status, ended=_now())
+
+
+def find_records(root: Path) -> list[Path]:
+    """Folders below ``root`` that hold a record, and those of their parents, parents first."""
+    found = {path.parent.resolve() for path in root.rglob(FILE)}
+    for folder in list(found):
+        record = read_record(folder)
+        if record and record.parent:
+            found.add((folder / record.parent).resolve())
+    return sorted(found, key=lambda folder: (_has_parent(folder), _start_of(folder)))
+
+
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested recipe -> dotted parameters, as MLflow shows them."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = str(value)
+    return flat
+
+
+def _has_parent(folder: Path) -> bool:
+    record = read_record(folder)
+    return record is not None and record.parent is not None
+
+
+def _start_of(folder: Path) -> int:
+    record = read_record(folder)
+    return record.started if record else 0
+
+
+def _now() -> int:
+    return int(time.time() * 1000)

@@ -1,0 +1,300 @@
+"""The training step and the loop, the same under any launcher; reads only RANK, WORLD_SIZE, LOCAL_RANK, MASTER_*.
+
+Read top to bottom: ``train`` -> ``_Trainer.run`` -> ``_Trainer.step``. Everything that varies is in the recipe; the
+order of triples is a function of (seed, step), so the state of a run is its weights, its optimiser and one number.
+"""
+
+import contextlib
+import datetime
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from filelock import FileLock, Timeout
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from datagen.errors import DsffnetError
+from datagen.store import Dataset, open_dataset
+from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from training.data import TripleOrder, VertexBank
+from training.inference import network_from, predict
+from training.journal import Journal
+from training.losses import pose_transfer_loss
+from training.metrics import point_mesh_distance
+from training.recipe import TrainingRecipe
+
+
+class TrainingError(DsffnetError):
+    """Training cannot go on: non-finite loss, too few CPUs, another process on the same run."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Where this process stands among those that train together."""
+
+    rank: int
+    count: int
+    local: int
+
+    @classmethod
+    def from_environment(cls) -> "Ranks":
+        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
+        return cls(*(int(os.environ.get(name, default)) for name, default in zip(names, "010", strict=True)))
+
+
+def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
+    """Train until the recipe's last step, from the newest sound checkpoint of ``run`` if there is one.
+
+    Parameters
+    ----------
+    recipe
+        What to train and how.
+    data
+        Store URL of a complete dataset.
+    run
+        Folder of the run; rank 0 writes to it.
+
+    Returns
+    -------
+    int
+        The step reached (fewer than the recipe's steps only after SIGTERM).
+
+    Raises
+    ------
+    TrainingError, DatasetError, CheckpointError, StorageError
+        See their messages; the last good checkpoint is kept.
+    """
+    ranks = Ranks.from_environment()
+    with _process_group(ranks, recipe), _alone(run, ranks):
+        return _Trainer(recipe, open_dataset(data), run, ranks).run()
+
+
+class _Trainer:
+    def __init__(self, recipe: TrainingRecipe, dataset: Dataset, run: Path, ranks: Ranks) -> None:
+        if recipe.batch % ranks.count:
+            raise TrainingError(f"batch {recipe.batch} cannot be shared equally by {ranks.count} ranks")
+        self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
+        self.device = _device(recipe, ranks)
+        self.bank = VertexBank(dataset, dataset.identities("training"), device=self.device)
+        self.order = TripleOrder(
+            dataset.identities("training"), dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed
+        )
+        self.last_step = recipe.steps or recipe.epochs * self.order.steps_per_epoch
+        torch.manual_seed(recipe.seed)
+        self.network = network_from(recipe.network).to(self.device)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+        )
+        self.schedule = _schedule(self.optimiser, recipe, self.order.steps_per_epoch, self.last_step)
+        self.done = self._resume()
+        self.model = DistributedDataParallel(self.network) if ranks.count > 1 else self.network
+        self.is_writer = ranks.rank == 0
+        self.stopping, self._stop = False, _stop_on_sigterm()
+
+    def run(self) -> int:
+        journal = Journal(self.folder / "metrics.jsonl") if self.is_writer else None
+        probe = _EvaluationProbe(self.dataset, self.recipe, self.device) if self.is_writer else None
+        meter = _Meter(self.recipe.batch)
+        triples = self.order.batches(first_step=self.done, rank=self.ranks.rank, ranks=self.ranks.count)
+        while self.done < self.last_step and not self.stopping:
+            values = self.step(next(triples), meter)
+            self.done += 1
+            last = self.done == self.last_step
+            if journal and probe and (self.done % self.recipe.log_every == 0 or last):
+                if self.done % self.recipe.evaluate_every == 0 or last:
+                    values |= probe.measure(self.network)
+                journal.write(self.done, {name: float(value) for name, value in values.items()} | meter.read())
+            if self.done % self.recipe.checkpoint_every == 0 or last:
+                self._save()
+        if self.stopping:
+            self._save()
+        if journal:
+            journal.close()
+        return self.done
+
+    def step(self, triples: Any, meter: "_Meter") -> dict[str, Tensor | float]:
+        """Forward, loss, backward, finite check over all ranks, clip, optimiser step."""
+        with meter.waiting():
+            batch = self.bank.batch(triples)
+        self.optimiser.zero_grad(set_to_none=True)
+        prediction = self.model(source=batch.source, target=batch.target)
+        loss, terms = pose_transfer_loss(prediction, batch.truth, self.bank.edges, edge_weight=self.recipe.edge_weight)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))
+        rate = self.schedule.get_last_lr()[0]
+        self._agree_to_go_on(loss, norm, triples)
+        self.optimiser.step()
+        self.schedule.step()
+        values: dict[str, Tensor | float] = {f"loss/{name}": value.detach() for name, value in terms.items()}
+        return values | {"loss/total": loss.detach(), "gradient_norm": norm, "learning_rate": rate}
+
+    def _agree_to_go_on(self, loss: Tensor, norm: Tensor, triples: Any) -> None:
+        """One exchange between the ranks: stop all before the optimiser step if any loss or gradient is not finite,
+        and after it if any was told to stop.
+        """
+        bad = not bool(torch.isfinite(loss.detach() + norm))
+        any_bad, self.stopping = _any_rank([bad, self._stop.is_set()], self.ranks)
+        if any_bad:
+            where = f"this rank's triples were {triples.tolist()}" if bad else "on another rank"
+            raise TrainingError(
+                f"loss or gradient is not finite at step {self.done + 1} ({where}). "
+                "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip"
+            )
+
+    def _save(self) -> None:
+        """Rank 0 writes, all wait, and a failure to write stops every rank."""
+        failure: DsffnetError | None = None
+        if self.is_writer:
+            try:
+                save_checkpoint(
+                    self.folder,
+                    about={
+                        "step": self.done,
+                        "recipe": self.recipe.model_dump(mode="json"),
+                        "dataset": self.dataset.uuid,
+                    },
+                    weights=self.network.state_dict(),
+                    state={"optimiser": self.optimiser.state_dict(), "schedule": self.schedule.state_dict()},
+                    keep=self.recipe.keep_checkpoints,
+                )
+            except DsffnetError as error:
+                failure = error
+        if _any_rank([failure is not None], self.ranks)[0]:
+            raise failure or TrainingError("rank 0 could not write a checkpoint")
+
+    def _resume(self) -> int:
+        found = load_checkpoint(self.folder)
+        if found is None:
+            return 0
+        if found.dataset != self.dataset.uuid:
+            raise CheckpointError(
+                f"{self.folder} was trained on dataset {found.dataset}, not on {self.dataset.url} "
+                f"({self.dataset.uuid}). Choose another --out, or add --fresh to start over"
+            )
+        self.recipe.require_same_learning(TrainingRecipe.model_validate(found.recipe), where=str(self.folder))
+        state = found.state()
+        self.network.load_state_dict(found.weights())
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.schedule.load_state_dict(state["schedule"])
+        return found.step
+
+
+class _EvaluationProbe:
+    """PMD on a small fixed part of the evaluation lists, for the training curve."""
+
+    def __init__(self, dataset: Dataset, recipe: TrainingRecipe, device: torch.device) -> None:
+        bank = VertexBank(dataset, dataset.identities("evaluation"), device=device)
+        self._batches = {}
+        for pose_type in ("seen", "unseen"):
+            triples = dataset.evaluation_triples(pose_type)[: recipe.evaluate_triples]
+            if len(triples):
+                self._batches[pose_type] = bank.batch(triples)
+
+    @torch.no_grad()
+    def measure(self, network: nn.Module) -> dict[str, float]:
+        network.eval()
+        found = {}
+        for pose_type, batch in self._batches.items():
+            prediction = predict(network, batch)
+            found[f"evaluation/pmd_{pose_type}"] = float(point_mesh_distance(prediction, batch.truth).mean())
+        network.train()
+        return found
+
+
+class _Meter:
+    """Throughput and the share of time spent waiting for input, since the last reading."""
+
+    def __init__(self, batch: int) -> None:
+        self._batch = batch
+        self._reset()
+
+    def _reset(self) -> None:
+        self._began, self._waited, self._steps = time.perf_counter(), 0.0, 0
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._waited += time.perf_counter() - began
+        self._steps += 1
+
+    def read(self) -> dict[str, float]:
+        seconds = time.perf_counter() - self._began
+        found = {"meshes_per_second": self._steps * self._batch / seconds, "input_wait": self._waited / seconds}
+        self._reset()
+        return found
+
+
+def _schedule(
+    optimiser: torch.optim.Optimizer, recipe: TrainingRecipe, steps_per_epoch: int, steps: int
+) -> torch.optim.lr_scheduler.LRScheduler:
+    schedule = recipe.schedule
+    if schedule.name == "one_cycle":
+        return torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, recipe.learning_rate, total_steps=steps + 1, pct_start=schedule.warm_up, cycle_momentum=False
+        )
+    return torch.optim.lr_scheduler.StepLR(
+        optimiser, step_size=schedule.decay_epochs * steps_per_epoch, gamma=schedule.decay
+    )
+
+
+def _device(recipe: TrainingRecipe, ranks: Ranks) -> torch.device:
+    if recipe.device == "cpu" or (recipe.device == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise TrainingError("training.device is 'cuda', but torch sees no CUDA device. Use --set training.device=cpu")
+    torch.cuda.set_device(ranks.local)
+    return torch.device("cuda", ranks.local)
+
+
+def _any_rank(flags: list[bool], ranks: Ranks) -> list[bool]:
+    """For each flag, whether it is raised on any rank; every rank gets the same answer."""
+    if ranks.count == 1:
+        return flags
+    device = torch.device("cuda", ranks.local) if dist.get_backend() == "nccl" else "cpu"
+    shared = torch.tensor(flags, dtype=torch.float32, device=device)
+    dist.all_reduce(shared, op=dist.ReduceOp.MAX)
+    return [bool(flag) for flag in shared.tolist()]
+
+
+@contextlib.contextmanager
+def _process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
+    """Join the process group, unless a launcher (Ray Train) has done so; leave it only after a clean end."""
+    if ranks.count == 1 or dist.is_initialized():
+        yield
+        return
+    backend = "nccl" if torch.cuda.is_available() and recipe.device != "cpu" else "gloo"
+    dist.init_process_group(backend, timeout=datetime.timedelta(seconds=recipe.timeout))
+    yield
+    dist.barrier()
+    dist.destroy_process_group()
+
+
+@contextlib.contextmanager
+def _alone(run: Path, ranks: Ranks) -> Iterator[None]:
+    """One training a run: rank 0 holds a lock that the operating system drops if the process dies."""
+    if ranks.rank != 0:
+        yield
+        return
+    run.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(run / ".lock").acquire(timeout=30):
+            yield
+    except Timeout as error:
+        raise TrainingError(f"another process is training in {run}. Wait for it, or stop it, then run again") from error
+
+
+def _stop_on_sigterm() -> threading.Event:
+    """An event that SIGTERM sets, where this thread may install a handler (Ray Train's workers may not)."""
+    stop = threading.Event()
+    with contextlib.suppress(ValueError):
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    return stop

@@ -1,0 +1,1 @@
+"""Chains data generation, training and evaluation; the only package that knows both of the others."""

@@ -1,0 +1,67 @@
+"""One script, two ways to run: inside a Ray job (or with RAY_ADDRESS set) connect; otherwise a Ray of our own."""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from datagen.errors import RecipeError
+
+_ROOT = Path(__file__).resolve().parents[1]
+_OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
+
+
+def on_cluster() -> bool:
+    """Whether this process belongs to a Ray cluster that it did not start."""
+    return bool(os.environ.get("RAY_ADDRESS") or os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR"))
+
+
+if not on_cluster():
+    # Ray's own default for a cluster of ours; said before Ray is first imported, which is when it reads it, it is silent.
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+
+
+def require_reachable(place: str, *, option: str) -> str:
+    """A place that other machines and later processes can find; relative ones are made absolute on one machine only.
+
+    Raises
+    ------
+    RecipeError
+        A relative path while running on a cluster, where the working directory is a throw-away copy.
+    """
+    if "://" in place or os.path.isabs(place):
+        return place
+    if on_cluster():
+        raise RecipeError(
+            f"{option} {place!r} is a relative path, but this runs on a Ray cluster, where the working directory is a "
+            f"throw-away copy that is removed after the job. Give an absolute path that all machines share, e.g. "
+            f"{option} /data/{place}"
+        )
+    return os.path.abspath(place)
+
+
+@contextmanager
+def ray_cluster() -> Iterator[None]:
+    """A connected Ray; one that was started here is stopped at the end."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    if on_cluster():
+        ray.init(logging_level=logging.WARNING)
+    else:
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            object_store_memory=_OBJECT_STORE,
+            logging_level=logging.ERROR,
+            log_to_driver=False,  # errors of tasks and ranks reach the driver anyway; logs: /tmp/ray/session_latest
+            runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
+        )
+    try:
+        yield
+    finally:
+        ray.shutdown()

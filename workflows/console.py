@@ -1,0 +1,167 @@
+"""How the commands speak: options, errors in one line with an exit status, and the closing words."""
+
+import argparse
+import errno
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from datagen.errors import DsffnetError, RecipeError
+from datagen.generate import remove
+from training.record import read_record
+from training.tracking import ALIAS, EXPERIMENT, MODEL, Server
+from workflows.recipe import describe_fields, known_recipes
+
+_OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr")
+
+
+def guarded(main: Callable[[], None]) -> None:
+    """Run a command; what a person can mend becomes one line on standard error and an exit status.
+
+    Status 0: done, 1: failed, 2: usage or an invalid recipe, 130: interrupted.
+    """
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        main()
+    except DsffnetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to go on from here", file=sys.stderr)
+        sys.exit(130)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT):
+            raise
+        print(f"error: {error}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
+        sys.exit(1)
+
+
+def workflow_parser(text: str) -> argparse.ArgumentParser:
+    """Options shared by the workflow scripts."""
+    made = parser(text)
+    add_recipe_options(made)
+    made.add_argument("--out", metavar="DIR", help="folder for dataset, run and MLflow store (default runs/RECIPE)")
+    add_tracking_option(made)
+    made.add_argument("--fresh", action="store_true", help="remove what DIR holds of this workflow and start over")
+    return made
+
+
+def parser(text: str) -> argparse.ArgumentParser:
+    """A parser whose help is ``text`` as written and, at its end, every key of a recipe."""
+    keys = "\n".join(describe_fields())
+    return argparse.ArgumentParser(
+        description=text,
+        epilog=f"keys for --set, with their defaults:\n{keys}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_recipe_options(made: argparse.ArgumentParser) -> None:
+    """--recipe and --set."""
+    names = ", ".join(known_recipes())
+    made.add_argument("--recipe", default="quickstart", metavar="NAME|FILE", help=f"a YAML file, or one of {names}")
+    made.add_argument(
+        "--set",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="section.key=value",
+        help="change keys of the recipe, in any order",
+    )
+
+
+def add_tracking_option(made: argparse.ArgumentParser) -> None:
+    """--tracking-uri."""
+    made.add_argument(
+        "--tracking-uri", metavar="URI", help="MLflow server (default: MLFLOW_TRACKING_URI, else SQLite in the folder)"
+    )
+
+
+def server_of(out: Path, uri: str | None) -> Server:
+    """The MLflow server to mirror to: as asked, as the environment says, or a SQLite store in ``out``."""
+    uri = uri or os.environ.get("MLFLOW_TRACKING_URI")
+    if uri:
+        if uri.startswith("sqlite:///") and not uri.startswith("sqlite:////"):
+            uri = f"sqlite:///{os.path.abspath(uri.removeprefix('sqlite:///'))}"
+        return Server(uri)
+    out = out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    return Server(f"sqlite:///{out / 'mlflow.db'}", artifacts=out / "mlartifacts")
+
+
+def server_of_record(root: Path, uri: str | None) -> Server:
+    """The server for a record; a run that is no part of a workflow has its SQLite store beside it."""
+    record = read_record(root)
+    is_workflow = record is not None and record.kind == "workflow"
+    return server_of(root if is_workflow else root.parent, uri)
+
+
+def remove_run(run: Path) -> None:
+    """Remove a training run.
+
+    Raises
+    ------
+    RecipeError
+        The folder does not look like a run.
+    """
+    if run.exists() and any(run.iterdir()) and not (run / "record.json").exists():
+        raise RecipeError(f"{run} holds files but no run of ours, so --fresh leaves it alone. Choose another --out")
+    shutil.rmtree(run, ignore_errors=True)
+
+
+def start_over(out: Path) -> None:
+    """Remove what a workflow keeps in ``out``, and nothing else; the MLflow store stays.
+
+    Raises
+    ------
+    RecipeError
+        The folder does not look like a workflow's.
+    """
+    if not out.exists():
+        return
+    if any(out.iterdir()) and not (out / "recipe.yaml").exists():
+        raise RecipeError(
+            f"{out} holds files but no workflow of ours, so --fresh leaves it alone. Choose another --out"
+        )
+    for name in _OWN:
+        path = out / name
+        if name == "dataset.zarr":
+            remove(str(path))
+        elif path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def closing_words(out: Path, server: Server) -> str:
+    """The table, where everything lies, and what to try next."""
+    evaluation = out / "run" / "evaluation"
+    table = (evaluation / "tables.md").read_text()
+    shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
+    run = shown / "run"
+    here = shown / "run" / "evaluation"
+    meshes = here / "meshes"
+    ui = (
+        f"make ui OUT={shown}"
+        if server.uri.startswith("sqlite")
+        else f"open {server.uri} in a browser (experiment {EXPERIMENT!r})"
+    )
+    return f"""
+{table}
+Where everything lies
+  pictures      {here}/figures/examples.png, training-curve.png
+  viewer        {here}/viewer.html  (turn and zoom; open it in a browser)
+  meshes        {here}/meshes/*.glb
+  table, rows   {here}/tables.md, rows.csv
+  run           {run}  (weights in checkpoints/, metrics.jsonl)
+  dataset       {shown}/dataset.zarr
+  MLflow        {server.uri}, experiment {EXPERIMENT!r}, model 'models:/{MODEL}@{ALIAS}'
+
+Try next
+  {ui}
+  dsffnet transfer --model {run} --source {meshes}/00-source.glb --target {meshes}/01-target.glb --out posed.glb
+  python workflows/full.py --out runs/custom --set data.identities.seed=7 data.identities.training=24
+"""

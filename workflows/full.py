@@ -1,0 +1,104 @@
+"""From nothing to a trained, evaluated, looked-at model: generate, train, evaluate, with MLflow watching.
+
+    python workflows/full.py                                       # the recipe 'quickstart', into runs/quickstart
+    python workflows/full.py --recipe smoke --out /tmp/smoke
+    python workflows/full.py --set training.steps=8000 --out runs/longer
+    ray job submit --working-dir . -- python workflows/full.py --out /data/runs/quickstart
+
+Run the same command again to go on from where it was; finished stages are skipped.
+"""
+
+import sys
+from pathlib import Path
+
+_ROOT = str(Path(__file__).resolve().parents[1])
+if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its files would hide packages
+    sys.path[0] = _ROOT
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+
+from datagen.errors import DsffnetError
+from datagen.store import open_dataset
+from training.record import update_record
+from training.tracking import Mirror
+from workflows.cluster import ray_cluster, require_reachable
+from workflows.console import closing_words, guarded, server_of, start_over, workflow_parser
+from workflows.pipeline import evaluate_stage, generate_stage, is_evaluated, is_trained, recorded, train_stage
+from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
+from workflows.stages import Stage, run_stage
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Parse, then run the stages while a mirror keeps MLflow up to date."""
+    options = workflow_parser(__doc__ or "").parse_args(arguments)
+    recipe = load_recipe(options.recipe, options.set)
+    name = Path(options.recipe).stem
+    out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
+    server = server_of(out, options.tracking_uri)
+    if options.fresh:
+        start_over(out)
+    mirror = Mirror(out, server)
+    mirror.start()
+    try:
+        run_workflow(recipe, out)
+    finally:
+        outage = mirror.close()
+    print(closing_words(out, server))
+    if outage:
+        raise outage
+
+
+def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
+    """All stages of a recipe into the folder ``out``; finished ones are skipped, without so much as starting Ray."""
+    data, run = str(out / "dataset.zarr"), out / "run"
+    sections = recipe.model_dump(mode="json")
+    with ExitStack() as around:
+        begin = _once(lambda: _begin(around, recipe, out))
+        generate = Stage(
+            "generate",
+            depends_on=sections["data"],
+            intact=lambda: _is_complete(data),
+            work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out),
+        )
+        train = Stage(
+            "train",
+            depends_on=[sections["data"], sections["training"]],
+            intact=lambda: is_trained(recipe.training, data, run),
+            work=partial(train_stage, recipe.training, data, run, parent=out),
+        )
+        evaluate = Stage(
+            "evaluate",
+            depends_on=[sections["data"], sections["training"], sections["evaluation"]],
+            intact=lambda: is_evaluated(run),
+            work=partial(evaluate_stage, recipe.evaluation, data, run, parent=out),
+        )
+        for stage in (generate, train, evaluate):
+            run_stage(stage, out=out, before=begin)
+
+
+def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path) -> None:
+    """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a connected Ray."""
+    save_recipe(recipe, out / "recipe.yaml")
+    parameters = recipe.model_dump(mode="json")
+    around.enter_context(recorded(out, kind="workflow", name=out.name, parent=None, parameters=parameters))
+    update_record(out, artifacts=["recipe.yaml"])
+    around.enter_context(ray_cluster())
+
+
+def _once(work: Callable[[], None]) -> Callable[[], None]:
+    waiting = [work]
+    return lambda: waiting.pop()() if waiting else None
+
+
+def _is_complete(data: str) -> bool:
+    try:
+        open_dataset(data)
+    except DsffnetError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    guarded(main)

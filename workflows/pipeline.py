@@ -1,0 +1,195 @@
+"""The stages' work: generate, train, evaluate. Each leaves a record for MLflow, whatever happens."""
+
+import json
+import platform
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.errors import DsffnetError
+from datagen.generate import generate, ray_runner
+from datagen.grid import Grid
+from datagen.mesh import bounding_box, write_atomically
+from datagen.recipe import DatasetRecipe
+from datagen.store import Dataset, ManifestRow, open_dataset
+from datagen.store.verify import describe
+from training.checkpoint import load_checkpoint
+from training.data import TripleOrder
+from training.evaluation import NO_OPS, Row, evaluate, write_rows
+from training.figures import contact_sheet
+from training.inference import load_trained
+from training.launch import launch
+from training.recipe import EvaluationRecipe, TrainingRecipe
+from training.record import begin_record, end_record, flatten, update_record
+from training.showcase import draw_examples, draw_training_curve, examples_of
+from training.tables import COLUMNS, mean_of, methods_of, report
+from training.tracking import MODEL
+from workflows.progress import bar, following, sampling
+
+METHOD = "DSFFNet"
+
+
+@contextmanager
+def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, parameters: dict[str, Any]) -> Iterator[None]:
+    """Keep a record in ``folder`` while the block runs, and end it as FINISHED, FAILED or KILLED."""
+    begin_record(folder, name=name, kind=kind, parent=parent, parameters=flatten(parameters))
+    try:
+        yield
+    except KeyboardInterrupt:
+        end_record(folder, "KILLED")
+        raise
+    except BaseException:
+        end_record(folder, "FAILED")
+        raise
+    end_record(folder, "FINISHED")
+
+
+def generation_bar(rows: Iterable[ManifestRow], grid: Grid) -> Iterator[ManifestRow]:
+    """A bar that counts meshes while shards come in."""
+    with bar(total=grid.mesh_count, what="generate", unit="mesh") as shown:
+        for row in rows:
+            shown.update(row.rows)
+            yield row
+
+
+def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Path | None) -> None:
+    """Make the dataset, with Ray tasks, and a contact sheet of it."""
+    with recorded(folder, kind="generate", name="generate", parent=parent, parameters=recipe.model_dump(mode="json")):
+        with sampling(folder / "system.jsonl"):
+            dataset = generate(recipe, url, run=ray_runner, progress=generation_bar)
+        write_atomically(folder / "dataset.json", json.dumps(describe(url), indent=1).encode())
+        draw_contact_sheet(dataset, folder / "contact-sheet.png")
+        statistics = dataset.attributes["statistics"]
+        update_record(
+            folder,
+            dataset=about_dataset(dataset),
+            artifacts=["dataset.json", "contact-sheet.png"],
+            metrics={"meshes": float(statistics["meshes"]), "megabytes": statistics["bytes"] / 1e6},
+        )
+
+
+def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | None) -> None:
+    """Train to the recipe's last step, from the newest checkpoint if there is one."""
+    dataset = open_dataset(data)
+    with recorded(run, kind="train", name="train", parent=parent, parameters=recipe.model_dump(mode="json")):
+        update_record(run, dataset=about_dataset(dataset), artifacts=["recipe.yaml", "provenance.json"])
+        _write_run_head(recipe, dataset, run)
+        with following(run / "metrics.jsonl", steps=last_step(recipe, dataset), system=run / "system.jsonl"):
+            launch(recipe, data=data, run=run)
+        draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
+        artifacts = ["recipe.yaml", "provenance.json", "metrics.jsonl", "figures"]
+        update_record(run, artifacts=artifacts, model=MODEL)
+
+
+def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Path | None) -> str:
+    """Measure the run, write rows, tables, figures, meshes and viewer to RUN/evaluation; returns the report."""
+    folder, dataset = run / "evaluation", open_dataset(data)
+    with recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=recipe.model_dump(mode="json")):
+        with sampling(folder / "system.jsonl"):
+            progress = partial(bar, what="evaluate", unit="task")
+            rows = evaluate(
+                run, data, recipe, tasks=ray_runner, method=METHOD, progress=lambda chunks, n: progress(chunks, total=n)
+            )
+        write_rows(rows, folder / "rows.csv")
+        text = report(rows, title=_title(dataset), emd_points=_emd_points(recipe, dataset))
+        write_atomically(folder / "tables.md", text.encode())
+        network, _, _ = load_trained(run)
+        draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
+        baselines = {
+            f"{name} ({pose_type})": mean_of(rows, method=name, pose_type=pose_type, field="pmd")
+            for name, pose_type in ((NO_OPS[0], "unseen"), (NO_OPS[1], "unseen"))
+            if name in methods_of(rows)
+        }
+        draw_training_curve(run, folder / "figures" / "training-curve.png", baselines=baselines)
+        update_record(
+            folder,
+            dataset=about_dataset(dataset),
+            artifacts=["rows.csv", "tables.md", "viewer.html", "figures", "meshes"],
+            metrics=summary_metrics(rows),
+        )
+    return text
+
+
+def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
+    """The step at which a training of this recipe on this dataset ends."""
+    identities = dataset.identities("training")
+    order = TripleOrder(identities, dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed)
+    return recipe.steps or recipe.epochs * order.steps_per_epoch
+
+
+def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
+    """Whether a run holds a sound checkpoint of the recipe's last step on this dataset."""
+    try:
+        dataset, checkpoint = open_dataset(data), load_checkpoint(run)
+        return checkpoint is not None and checkpoint.step >= last_step(recipe, dataset)
+    except DsffnetError:
+        return False
+
+
+def is_evaluated(run: Path) -> bool:
+    """Whether the outputs of an evaluation are there."""
+    names = ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png")
+    return all((run / "evaluation" / name).is_file() for name in names)
+
+
+def summary_metrics(rows: list[Row]) -> dict[str, float]:
+    """Means of the metrics as MLflow shows them, in the table's units: ``pmd_unseen``, ``no_op/...``."""
+    found = {}
+    for method in methods_of(rows):
+        prefix = "" if method == METHOD else f"{method.replace(' ', '_')}/"
+        for pose_type in sorted({row.pose_type for row in rows}):
+            for column in COLUMNS:
+                mean = mean_of(rows, method=method, pose_type=pose_type, field=column.field)
+                found[f"{prefix}{column.field}_{pose_type}"] = mean * column.factor
+    return found
+
+
+def about_dataset(dataset: Dataset) -> dict[str, str]:
+    """What identifies a dataset."""
+    keys = ("uuid", "recipe_sha256", "manifest_sha256")
+    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in keys}
+
+
+def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, poses: int = 8) -> Path:
+    """A picture of some identities (rows) in some poses (columns), both spread over the whole grid."""
+    grid = dataset.grid
+    chosen = np.unique(np.linspace(0, grid.identity_count - 1, identities).astype(int)).tolist()
+    columns = np.unique(np.linspace(0, len(grid.poses_of(0)) - 1, poses).astype(int)).tolist()
+    meshes = [[_standing(dataset.vertices(i, p)) for p in columns] for i in chosen]
+    labels = [f"identity {i}\n{grid.split(i)}" for i in chosen]
+    faces = [dataset.faces(i) for i in chosen]
+    return contact_sheet(meshes, faces, labels, [f"pose {p}" for p in columns], path)
+
+
+def _standing(vertices: np.ndarray) -> np.ndarray:
+    return vertices - bounding_box(vertices).centre
+
+
+def _title(dataset: Dataset) -> str:
+    recipe = dataset.recipe
+    count = dataset.vertices(0, 0).shape[0]
+    return f"Pose transfer on {recipe.body.family} bodies of {count:,} vertices"
+
+
+def _emd_points(recipe: EvaluationRecipe, dataset: Dataset) -> int:
+    return min(recipe.emd_points, dataset.vertices(0, 0).shape[0])
+
+
+def _write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+    """recipe.yaml (what is trained) and provenance.json (with what, on what), before the work starts."""
+    import torch
+    import yaml
+
+    write_atomically(run / "recipe.yaml", yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
+    provenance = {
+        "dataset": about_dataset(dataset),
+        "data_provenance": dataset.attributes["provenance"],
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()} {platform.system()}",
+    }
+    write_atomically(run / "provenance.json", json.dumps(provenance, indent=1).encode())

@@ -1,0 +1,129 @@
+"""The recipe of a whole workflow: its sections, reading it from YAML, overrides, and errors a person can act on."""
+
+import difflib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, ValidationError
+
+from datagen.errors import RecipeError
+from datagen.recipe import DatasetRecipe, Frozen
+from training.recipe import EvaluationRecipe, TrainingRecipe
+
+_FOLDER = Path(__file__).parent / "recipes"
+
+
+class WorkflowRecipe(Frozen):
+    """Everything that a workflow does, apart from where its files go."""
+
+    description: str = Field("", description="one line for people")
+    data: DatasetRecipe = Field(default_factory=DatasetRecipe)
+    training: TrainingRecipe = Field(default_factory=TrainingRecipe)
+    evaluation: EvaluationRecipe = Field(default_factory=EvaluationRecipe)
+
+
+def known_recipes() -> dict[str, Path]:
+    """Recipes that come with the project, by name."""
+    return {path.stem: path for path in sorted(_FOLDER.glob("*.yaml"))}
+
+
+def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRecipe:
+    """Read a recipe by name or file, apply overrides ``section.key=value``, and check all of it.
+
+    Raises
+    ------
+    RecipeError
+        No such recipe, not YAML, an unknown key (the nearest one is named), or a value that cannot be.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    path = _find(name_or_file)
+    for override in overrides:
+        if "=" not in override:
+            raise RecipeError(f"--set {override!r} is not of the form section.key=value, e.g. --set training.steps=100")
+    try:
+        merged = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(list(overrides)))
+        values = OmegaConf.to_container(merged, resolve=True)
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
+        raise RecipeError(f"recipe {path} cannot be read: {error}") from error
+    return check_recipe(values, where=str(name_or_file))
+
+
+def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
+    """A recipe from nested values.
+
+    Raises
+    ------
+    RecipeError
+        With one line a fault: which key, what is wrong, what was given.
+    """
+    if not isinstance(values, dict):
+        raise RecipeError(f"recipe {where} is not a mapping of sections (data, training, evaluation)")
+    try:
+        return WorkflowRecipe.model_validate(values)
+    except ValidationError as error:
+        faults = "; ".join(_describe(fault) for fault in error.errors())
+        raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help") from error
+
+
+def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
+    """Write the resolved recipe as YAML."""
+    import yaml
+
+    from datagen.mesh import write_atomically
+
+    write_atomically(path, yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
+
+
+def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -> Iterator[str]:
+    """One line for each key of the recipe: dotted name, default, meaning."""
+    for name, field in model.model_fields.items():
+        sections = [part for part in _parts(field.annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+        for section in sections:
+            yield from describe_fields(section, f"{prefix}{name}.")
+        if not sections:
+            default = field.get_default(call_default_factory=True)
+            yield f"  {prefix}{name} = {default}" + (f"    {field.description}" if field.description else "")
+
+
+def _find(name_or_file: str) -> Path:
+    known = known_recipes()
+    if name_or_file in known:
+        return known[name_or_file]
+    path = Path(name_or_file)
+    if path.suffix in (".yaml", ".yml"):
+        if path.is_file():
+            return path
+        raise RecipeError(f"no recipe file {path}")
+    raise RecipeError(f"no recipe {name_or_file!r}{_nearest(name_or_file, list(known))}; there are {', '.join(known)}")
+
+
+def _describe(fault: Any) -> str:
+    # pydantic puts the name of a union's chosen member into the location; a person never wrote it
+    location = [str(part) for part in fault["loc"]]
+    key = ".".join(part for i, part in enumerate(location) if not (i and location[i - 1] == "body" and part in _BODIES))
+    if fault["type"] == "extra_forbidden":
+        return f"unknown key {key!r}{_nearest(key, [line.split()[0] for line in describe_fields()])}"
+    return f"{key}: {fault['msg']} (given: {fault['input']!r})"
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    from typing import get_args
+
+    members = get_args(annotation)
+    if isinstance(annotation, type) or not members:
+        yield annotation
+    else:
+        for member in members:
+            yield from _parts(member)
+
+
+_BODIES = {"anny", "leg"}

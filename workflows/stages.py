@@ -1,0 +1,56 @@
+"""A stage has a fingerprint of what it depends on; one that was finished with the same fingerprint is skipped."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from datagen.mesh import write_atomically
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a workflow.
+
+    ``depends_on`` is everything that its result depends on; ``intact`` says whether its outputs are still there.
+    """
+
+    name: str
+    depends_on: Any
+    intact: Callable[[], bool]
+    work: Callable[[], object]
+
+    @property
+    def fingerprint(self) -> str:
+        return hashlib.sha256(json.dumps(self.depends_on, sort_keys=True).encode()).hexdigest()
+
+
+def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
+    """Do a stage, after ``before``, unless it is done; returns whether it was done now."""
+    mark = out / "stages" / f"{stage.name}.json"
+    if _done(mark, stage) and stage.intact():
+        say(f"{stage.name}: skipped, finished before")
+        return False
+    before()
+    say(f"{stage.name}: begins")
+    began = time.monotonic()
+    stage.work()
+    seconds = time.monotonic() - began
+    write_atomically(mark, json.dumps({"fingerprint": stage.fingerprint, "seconds": seconds}).encode())
+    say(f"{stage.name}: finished in {seconds:.0f} s")
+    return True
+
+
+def say(text: str) -> None:
+    """One line for people, with the time of day, at once."""
+    print(f"[{time.strftime('%H:%M:%S')}] {text}", flush=True)
+
+
+def _done(mark: Path, stage: Stage) -> bool:
+    try:
+        return bool(json.loads(mark.read_text())["fingerprint"] == stage.fingerprint)
+    except (OSError, ValueError, KeyError):
+        return False
