@@ -119,11 +119,12 @@ def generate(
     DatasetError
         A dataset of another recipe is there, or somebody else is writing to it.
     """
+    if not fresh and _complete(url, recipe):
+        return open_dataset(url)
     with writing_alone(url):
         if fresh:
             remove(url)
-        if not _complete(url, recipe):
-            _make_missing(recipe, url, run, progress)
+        _make_missing(recipe, url, run, progress)
     return open_dataset(url)
 
 

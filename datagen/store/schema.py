@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from datagen.errors import DatasetError
@@ -95,11 +96,17 @@ def attributes_of(group: zarr.Group) -> dict[str, Any]:
 
 def read_bytes(group: zarr.Group, path: str) -> bytes | None:
     """Raw bytes of one object of the dataset's store, or None where there is none."""
-    from zarr.core.buffer import default_buffer_prototype
-
-    key = f"{group.path}/{path}" if group.path else path
-    found = sync(group.store.get(key, default_buffer_prototype()))
+    found = sync(group.store.get(_key(group, path), default_buffer_prototype()))
     return None if found is None else found.to_bytes()
+
+
+def delete_object(group: zarr.Group, path: str) -> None:
+    """Remove one object of the dataset's store, if it is there."""
+    sync(group.store.delete(_key(group, path)))
+
+
+def _key(group: zarr.Group, path: str) -> str:
+    return f"{group.path}/{path}" if group.path else path
 
 
 def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
@@ -107,7 +114,7 @@ def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
 
     async def size(path: str) -> tuple[str, int] | None:
         try:
-            return path, await group.store.getsize(f"{group.path}/{path}" if group.path else path)
+            return path, await group.store.getsize(_key(group, path))
         except FileNotFoundError:
             return None
 

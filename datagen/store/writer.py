@@ -32,6 +32,7 @@ from datagen.store.schema import (
     attributes_of,
     check_version,
     create_vertices_array,
+    delete_object,
     identity_name,
     open_group,
     read_bytes,
@@ -72,6 +73,7 @@ def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray
     """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
     with _writing(url):
         group = open_group(url, mode="r+")
+        delete_object(group, shard_path(shard))  # zarr would read a damaged one first where it reaches past the array
         array = array_at(group, vertices_path(shard.identity))
         array[shard.start : shard.stop] = vertices
     row = existing_shard(url, shard)

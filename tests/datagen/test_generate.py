@@ -1,0 +1,145 @@
+"""Generation as a pure function: any order, any interruption, any number of writers give the same bytes."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from datagen import generate as generation
+from datagen.errors import BodyError, DatasetError
+from datagen.generate import generate, inline, make_shard, prepare, writing_alone
+from datagen.grid import Grid
+from datagen.store import open_dataset
+from datagen.store.verify import find_faults
+from tests.support.files import tree_hash
+from tests.support.recipes import tiny_dataset
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupted_runner(order: list[int], stop_after: int) -> generation.Runner:
+    """Runs shards in a given order and dies after some of them."""
+
+    def run(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        if task is prepare:
+            yield from inline(task, arguments)
+            return
+        for count, place in enumerate(order):
+            if count == stop_after:
+                raise Interrupted
+            yield task(*arguments[place])
+
+    return run
+
+
+@given(st.permutations(range(12)), st.integers(0, 11), st.integers(0, 3))
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_order_and_any_interruption_give_the_same_bytes(
+    dataset: str, tmp_path_factory: pytest.TempPathFactory, order: list[int], stop_after: int, again: int
+) -> None:
+    assert len(Grid(tiny_dataset()).shards()) == 12
+    url = str(tmp_path_factory.mktemp("interrupted") / "leg.zarr")
+    for stop in (stop_after, again):
+        with pytest.raises(Interrupted):
+            generate(tiny_dataset(), url, run=interrupted_runner(order, stop))
+        with pytest.raises(DatasetError, match="incomplete"):
+            open_dataset(url)
+    generate(tiny_dataset(), url)
+    assert tree_hash(url) == tree_hash(dataset)
+
+
+def test_an_existing_shard_is_not_made_again(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.store.schema import open_group
+
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    made: list[Any] = []
+    monkeypatch.setattr(generation, "make_shard", lambda recipe, shard: made.append(shard) or make_shard(recipe, shard))
+    (spoilable / "identity/0001/vertices/c/1/0/0").unlink()
+    generate(tiny_dataset(), str(spoilable))
+    assert [(shard.identity, shard.number) for shard in made] == [(1, 1)]
+
+
+def test_two_generators_on_one_dataset(tmp_path: Path) -> None:
+    url = str(tmp_path / "leg.zarr")
+    with writing_alone(url), pytest.raises(DatasetError, match="another process is writing to"):
+        generate(tiny_dataset(), url)
+    assert not Path(url).exists()
+
+
+def test_sigkill_while_writing(dataset: str, tmp_path: Path) -> None:
+    """Killed at several moments, then finished by the same command: the undisturbed bytes."""
+    url = tmp_path / "leg.zarr"
+    code = (
+        "from datagen.generate import generate; from tests.support.recipes import tiny_dataset; import sys;"
+        "generate(tiny_dataset(), sys.argv[1])"
+    )
+    for shards_before_kill in (1, 4, 8):
+        process = subprocess.Popen([sys.executable, "-c", code, str(url)], cwd=Path(__file__).parents[2])
+        while process.poll() is None and len(list(url.rglob("vertices/c/*/0/0"))) < shards_before_kill:
+            time.sleep(0.002)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    generate(tiny_dataset(), str(url))
+    assert tree_hash(url) == tree_hash(dataset) and not list(find_faults(str(url)))
+
+
+def test_concurrent_writers_of_different_shards(dataset: str, tmp_path: Path) -> None:
+    """What Ray's tasks do, with threads: each writes whole shards, and nothing is lost."""
+
+    def threaded(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        results: list[Any] = [None] * len(arguments)
+        threads = [
+            threading.Thread(target=lambda i=i, a=a: results.__setitem__(i, task(*a))) for i, a in enumerate(arguments)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return iter(results)
+
+    generate(tiny_dataset(), str(tmp_path / "leg.zarr"), run=threaded)
+    assert tree_hash(tmp_path / "leg.zarr") == tree_hash(dataset)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_body_that_gives_non_finite_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float) -> None:
+    from datagen.bodies.leg import LegModel
+
+    real = LegModel.vertices
+
+    def broken(self: LegModel, parameters: Any, poses: Any) -> Any:
+        vertices = real(self, parameters, poses)
+        vertices[0, 0, 0] = bad
+        return vertices
+
+    monkeypatch.setattr(LegModel, "vertices", broken)
+    with pytest.raises(BodyError, match=r"identity 0 .*poses 0 to 3"):
+        generate(tiny_dataset(), str(tmp_path / "leg.zarr"))
+
+
+def test_a_body_that_gives_a_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.bodies.leg import LegModel
+
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 0)
+    with pytest.raises(BodyError, match="degenerate"):
+        generate(tiny_dataset(), str(tmp_path / "leg.zarr"))
+
+
+def test_more_identities_leave_the_first_ones_as_they_were() -> None:
+    small, large = tiny_dataset(), tiny_dataset(identities={"training": 5, "evaluation": 2})
+    for number in (0, 2):
+        small_shard, large_shard = (Grid(recipe).shards()[number * 2] for recipe in (small, large))
+        assert np.array_equal(make_shard(small, small_shard), make_shard(large, large_shard))

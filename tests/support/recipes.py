@@ -1,0 +1,38 @@
+"""Small recipes that run in a second."""
+
+from typing import Any
+
+from datagen.recipe import DatasetRecipe
+from training.recipe import TrainingRecipe
+
+
+def tiny_dataset(**changes: Any) -> DatasetRecipe:
+    """3 training and 2 evaluation legs of 32 vertices in 6 seen and 4 unseen poses, 4 poses a shard."""
+    values: dict[str, Any] = {
+        "body": {"family": "leg", "rings": 8, "segments": 4},
+        "identities": {"training": 3, "evaluation": 2},
+        "poses": {"seen": 6, "unseen": 4},
+        "triples": {"count": 5},
+        "store": {"poses_per_shard": 4},
+    }
+    return DatasetRecipe.model_validate(values | changes)
+
+
+def tiny_training(**changes: Any) -> TrainingRecipe:
+    """A few steps of a few channels, in this process."""
+    values: dict[str, Any] = {
+        "network": {"encoder_widths": (8, 8, 8), "decoder_widths": (8, 8, 8)},
+        "batch": 4,
+        "steps": 8,
+        "learning_rate": 0.003,
+        "schedule": {"name": "one_cycle"},
+        "gradient_clip": 1.0,
+        "launcher": "inline",
+        "device": "cpu",
+        "log_every": 1,
+        "evaluate_every": 4,
+        "evaluate_triples": 3,
+        "checkpoint_every": 4,
+        "keep_checkpoints": 3,
+    }
+    return TrainingRecipe.model_validate(values | changes)
