@@ -14,6 +14,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from training.losses import SHORTEST_EDGE
+
 POINT_MESH_DISTANCE_SCALE = 1e-4
 """Tables print PMD in units of this."""
 
@@ -25,9 +27,6 @@ EARTH_MOVER_DISTANCE_SCALE = 1e-3
 
 EARTH_MOVER_POINTS = 1024
 """Vertices of which the EMD is taken by default: an exact assignment takes time in the cube of this."""
-
-SHORTEST_EDGE = 1e-6
-"""Edges of the truth of at most this length (box) have no meaningful ratio: they count as perfect."""
 
 
 def point_mesh_distance(prediction: Tensor, truth: Tensor) -> Tensor:

@@ -32,6 +32,9 @@ from training.metrics import point_mesh_distance
 from training.recipe import TrainingRecipe
 
 
+_LOCK_SECONDS = 30.0  # how long to wait for the ranks of a killed driver to be gone
+
+
 class TrainingError(DsffnetError):
     """Training cannot go on: non-finite loss, too few CPUs, another process on the same run."""
 
@@ -108,10 +111,12 @@ class _Trainer:
             values = self.step(next(triples), meter)
             self.done += 1
             last = self.done == self.last_step
-            if journal and probe and (self.done % self.recipe.log_every == 0 or last):
-                if self.done % self.recipe.evaluate_every == 0 or last:
-                    values |= probe.measure(self.network)
-                journal.write(self.done, {name: float(value) for name, value in values.items()} | meter.read())
+            if self.done % self.recipe.log_every == 0 or last:
+                shared = _mean_over_ranks(values, self.ranks)
+                if journal and probe:
+                    if self.done % self.recipe.evaluate_every == 0 or last:
+                        shared |= probe.measure(self.network)
+                    journal.write(self.done, shared | meter.read())
             if self.done % self.recipe.checkpoint_every == 0 or last:
                 self._save()
         if self.stopping:
@@ -140,10 +145,12 @@ class _Trainer:
         """One exchange between the ranks: stop all before the optimiser step if any loss or gradient is not finite,
         and after it if any was told to stop.
         """
-        bad = not bool(torch.isfinite(loss.detach() + norm))
+        culprit = not bool(torch.isfinite(loss))
+        bad = culprit or not bool(torch.isfinite(norm))
         any_bad, self.stopping = _any_rank([bad, self._stop.is_set()], self.ranks)
         if any_bad:
-            where = f"this rank's triples were {triples.tolist()}" if bad else "on another rank"
+            elsewhere = "on another rank" if self.ranks.count > 1 else "in the gradient only"
+            where = f"this rank's triples were {triples.tolist()}" if culprit else elsewhere
             raise TrainingError(
                 f"loss or gradient is not finite at step {self.done + 1} ({where}). "
                 "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip"
@@ -265,6 +272,17 @@ def _any_rank(flags: list[bool], ranks: Ranks) -> list[bool]:
     return [bool(flag) for flag in shared.tolist()]
 
 
+def _mean_over_ranks(values: dict[str, Tensor | float], ranks: Ranks) -> dict[str, float]:
+    """Means over the ranks, whose shares of a batch are equal; the means over the batch, that is."""
+    shared = torch.tensor([float(value) for value in values.values()], dtype=torch.float64)
+    if ranks.count > 1:
+        if dist.get_backend() == "nccl":
+            shared = shared.to(torch.device("cuda", ranks.local))
+        dist.all_reduce(shared)
+        shared /= ranks.count
+    return dict(zip(values, shared.tolist(), strict=True))
+
+
 @contextlib.contextmanager
 def _process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
     """Join the process group, unless a launcher (Ray Train) has done so; leave it only after a clean end."""
@@ -286,7 +304,7 @@ def _alone(run: Path, ranks: Ranks) -> Iterator[None]:
         return
     run.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(run / ".lock").acquire(timeout=30):
+        with FileLock(run / ".lock").acquire(timeout=_LOCK_SECONDS):
             yield
     except Timeout as error:
         raise TrainingError(f"another process is training in {run}. Wait for it, or stop it, then run again") from error

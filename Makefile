@@ -1,0 +1,100 @@
+# `make` lists the targets. Any of them first brings .venv up to date; when nothing changed that costs nothing.
+#
+# PYTHON       the interpreter for .venv; left empty, python3.11 or else python3, if that is 3.11 or newer
+# TORCH_INDEX  one more package index, for torch. Empty by default, so that a machine which reaches PyPI only can install; on Linux
+#              PyPI's torch brings CUDA (some 3 GB to fetch), right for a GPU. Without a GPU, the same release for CPU is 200 MB:
+#              make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# ARGS         more arguments for `make run` and `make test`
+# OUT          the folder whose MLflow store `make ui` shows; UI_PORT its port
+PYTHON ?=
+TORCH_INDEX ?=
+ARGS ?=
+OUT ?= runs/quickstart
+UI_PORT ?= 5000
+
+TORCH := torch==2.13.0
+BIN := .venv/bin
+# Written last. An environment whose installation was cut short has no such file, and is made anew.
+READY := .venv/.ready
+PIP_FLAGS = --disable-pip-version-check $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+
+define FIND_PYTHON
+for python in $(or $(PYTHON),python3.11 python3) ""; do \
+    "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && break; \
+done; \
+[ -n "$$python" ] || { echo "Python 3.11 or newer is needed; looked for: $(or $(PYTHON),python3.11 python3)." \
+    "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+endef
+
+.PHONY: help run test test-cluster lint bench ui constraints clean
+.DEFAULT_GOAL := help
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
+
+run: $(READY) ## the quickstart: generate data, train, evaluate, show (about 10 minutes on 2 cores)
+	@$(BIN)/python workflows/full.py $(ARGS)
+
+test: $(READY) ## the test suite
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a job submitted to them
+	@$(BIN)/python -m pytest -m cluster $(ARGS)
+
+lint: $(READY) ## style, types, import rules
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+bench: $(READY) ## every benchmark in benchmarks/
+	@for file in benchmarks/*.py; do \
+	    [ -e "$$file" ] || { echo "benchmarks/ has no benchmark"; break; }; \
+	    echo "== $$file"; $(BIN)/python "$$file" || exit 1; \
+	done
+
+ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another port: UI_PORT=5001)
+	@[ -e $(OUT)/mlflow.db ] || { echo "$(OUT)/mlflow.db is not there yet: 'make run' makes it;" \
+	    "for another folder: make ui OUT=folder" >&2; exit 1; }
+	@echo "MLflow: http://127.0.0.1:$(UI_PORT)   (ready in some seconds; Ctrl-C ends it)"
+	@MLFLOW_DISABLE_TELEMETRY=true $(BIN)/mlflow ui --host 127.0.0.1 --port $(UI_PORT) --workers 1 \
+	    --backend-store-uri sqlite:///$(abspath $(OUT))/mlflow.db --artifacts-destination $(abspath $(OUT))/mlartifacts
+
+# An environment that was ready is brought up to date in place; any other is made from nothing.
+# The lock (where there is flock) lets a second make wait, also for the pip of a make that was killed.
+$(READY): constraints.txt pyproject.toml deploy/requirements.txt
+	@set -e; \
+	exec 9<Makefile; flock 9 2>/dev/null || :; \
+	if [ ! -e $@ ]; then \
+	    $(FIND_PYTHON); \
+	    echo "Making .venv with $$("$$python" --version); the packages may take some minutes"; \
+	    [ -n "$(TORCH_INDEX)" ] || command -v nvidia-smi >/dev/null || [ "$$(uname -s)" != Linux ] || \
+	        echo "(no GPU here? TORCH_INDEX, explained in the Makefile, may save a large download)"; \
+	    "$$python" -m venv --clear .venv; \
+	fi; \
+	rm -f $@; \
+	[ -t 1 ] || quiet=--quiet; \
+	$(BIN)/python -m pip install $(PIP_FLAGS) $$quiet --constraint constraints.txt \
+	    --editable '.[dev]' --requirement deploy/requirements.txt; \
+	touch $@
+
+# The newest releases that fit together, from a fresh Python 3.11 on Linux x86-64. torch goes first so that its release is ours to
+# choose. CUDA packages are left out: the torch release itself asks for exact ones where it needs them.
+constraints: ## write constraints.txt anew
+	@set -e; $(FIND_PYTHON); \
+	"$$python" -c 'import sys; sys.exit("constraints.txt is made with Python 3.11" if sys.version_info[:2] != (3, 11) else 0)'; \
+	fresh=$$(mktemp -d); trap 'rm -rf "$$fresh"' EXIT; \
+	"$$python" -m venv "$$fresh"; \
+	"$$fresh/bin/pip" install --quiet $(PIP_FLAGS) $(TORCH); \
+	"$$fresh/bin/pip" install --quiet $(PIP_FLAGS) --editable '.[dev]' --requirement deploy/requirements.txt; \
+	"$$fresh/bin/pip" freeze --all --exclude-editable >"$$fresh/frozen"; \
+	{ echo "# Every package of the environment, for Python 3.11 on Linux x86-64. Written by: make constraints"; \
+	    sed -e '/^\(pip\|wheel\|triton\|nvidia-[^=]*\|cuda-[^=]*\)==/d' -e 's/+[a-z0-9.]*$$//' "$$fresh/frozen" | \
+	    LC_ALL=C sort -f -t= -k1,1; \
+	} >constraints.txt.partial; \
+	mv constraints.txt.partial constraints.txt; \
+	echo "constraints.txt: $$(grep -c == constraints.txt) packages"
+
+clean: ## remove .venv and caches; runs stay
+	@rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .grimp_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

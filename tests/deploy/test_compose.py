@@ -1,0 +1,177 @@
+"""docker-compose.yml against the Compose specification, and against what this project asks of it.
+
+The schema beside this file is compose-spec.json of the Compose Specification (Apache-2.0, compose-spec.LICENSE),
+unchanged, as the PyPI package check-jsonschema 0.39.0 ships it.
+"""
+
+import json
+import os
+import re
+import stat
+import subprocess
+from pathlib import Path, PurePosixPath
+
+import click
+import composefile
+import jsonschema
+import pytest
+from composefile import RAY_SERVICES, ROOT, Service
+
+SERVICES = composefile.services()
+PROJECT_SERVICES = ("mlflow", *RAY_SERVICES)
+
+
+@pytest.mark.parametrize("name", ["docker-compose.yml", "deploy/gpu.yml"])
+def test_follows_the_compose_specification(name: str) -> None:
+    schema = json.loads((Path(__file__).parent / "compose-spec.json").read_text())
+    jsonschema.validators.validator_for(schema)(schema).validate(composefile.load(name))
+
+
+def test_schema_notices_a_misspelt_key() -> None:
+    schema = json.loads((Path(__file__).parent / "compose-spec.json").read_text())
+    with pytest.raises(jsonschema.ValidationError, match="healthchek"):
+        jsonschema.validate({"services": {"mlflow": {"image": "x", "healthchek": {}}}}, schema)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_ports_are_published_on_loopback_only(name: str) -> None:
+    assert all(str(port).startswith("127.0.0.1:") for port in SERVICES[name].get("ports", []))
+
+
+def test_database_is_not_published() -> None:
+    assert "ports" not in SERVICES["postgres"]
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_server_has_a_health_check_and_comes_back(name: str) -> None:
+    service = SERVICES[name]
+    if service.get("profiles"):  # a job: it ends, so there is nothing to watch, and it must not start again by itself
+        assert service["restart"] == "no"
+        return
+    assert service["restart"] == "unless-stopped"
+    assert service["healthcheck"]["test"][0] == "CMD"
+    for argument in service["healthcheck"]["test"]:
+        if argument.startswith("/app/"):
+            assert (ROOT / PurePosixPath(argument).relative_to("/app")).is_file()
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_waits_for_the_health_of_what_it_needs(name: str) -> None:
+    for needed, how in SERVICES[name].get("depends_on", {}).items():
+        assert how == {"condition": "service_healthy"}
+        assert "healthcheck" in SERVICES[needed]
+
+
+def test_client_waits_for_all_it_talks_to() -> None:
+    assert set(SERVICES["client"]["depends_on"]) == {"mlflow", "ray-head", "ray-worker"}
+
+
+def size_in_bytes(text: str) -> int:
+    number, unit = re.fullmatch(r"(\d+)([kmg]b)", text).groups()  # type: ignore[union-attr]
+    return int(number) * int(1024 ** ("kmg".index(unit[0]) + 1))
+
+
+@pytest.mark.parametrize("name", ["ray-head", "ray-worker"])
+def test_object_store_fits_into_shared_memory(name: str) -> None:
+    object_store = int(composefile.option(SERVICES[name]["command"], "--object-store-memory"))
+    assert object_store <= size_in_bytes(SERVICES[name]["shm_size"])
+
+
+@pytest.mark.parametrize("name", RAY_SERVICES)
+def test_ray_asks_for_a_token(name: str) -> None:
+    assert SERVICES[name]["environment"]["RAY_AUTH_MODE"] == "token"
+    assert SERVICES[name]["env_file"] == ["deploy/secrets/ray.env"]
+
+
+def test_mlflow_answers_under_the_name_its_clients_use() -> None:
+    allowed = SERVICES["mlflow"]["environment"]["MLFLOW_SERVER_ALLOWED_HOSTS"].split(",")
+    uri = composefile.option(SERVICES["client"]["command"], "--tracking-uri")
+    assert uri.removeprefix("http://") in allowed
+    assert all(SERVICES[name]["environment"]["MLFLOW_TRACKING_URI"] == uri for name in RAY_SERVICES)
+    assert "*" not in allowed
+
+
+def test_data_lies_at_the_same_path_on_every_node() -> None:
+    assert {tuple(SERVICES[name]["volumes"]) for name in RAY_SERVICES} == {("data:/data",)}
+    assert composefile.option(SERVICES["client"]["command"], "--out").startswith("/data/")
+
+
+def test_artifacts_and_database_lie_on_volumes() -> None:
+    destination = composefile.option(SERVICES["mlflow"]["command"], "--artifacts-destination")
+    assert f"artifacts:{destination}" in SERVICES["mlflow"]["volumes"]
+    assert SERVICES["postgres"]["volumes"] == ["postgres:/var/lib/postgresql/data"]
+    assert set(composefile.load()["volumes"]) == {"artifacts", "postgres", "data"}
+
+
+def test_one_project_image_and_exact_tags() -> None:
+    assert len({SERVICES[name]["image"] for name in PROJECT_SERVICES}) == 1
+    base = re.findall(r"^FROM (\S+)", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    for image in [*base, *(service["image"] for service in SERVICES.values())]:
+        assert re.search(r":\d+\.\d+", image), f"{image} has no exact tag"
+
+
+def test_image_does_not_run_as_root() -> None:
+    users = re.findall(r"^USER (\S+)", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert users and users[-1] not in {"root", "0"}
+    assert not any("user" in SERVICES[name] for name in PROJECT_SERVICES)
+
+
+def click_command(words: list[str]) -> tuple[click.Command, list[str]]:
+    """The installed command line that a service calls, and the arguments that it gets."""
+    if words[:2] == ["mlflow", "server"]:
+        from mlflow.cli import server
+
+        return server, words[2:]
+    if words[:2] == ["ray", "start"]:
+        from ray.scripts.scripts import start
+
+        return start, words[2:]
+    from ray.dashboard.modules.job.cli import submit
+
+    assert words[:3] == ["ray", "job", "submit"]
+    return submit, words[3:]
+
+
+def parse(service: Service) -> dict[str, object]:
+    command, arguments = click_command(service["command"])
+    return dict(command.make_context(str(command.name), list(arguments)).params)
+
+
+@pytest.mark.parametrize("name", PROJECT_SERVICES)
+def test_installed_tools_accept_the_command(name: str) -> None:
+    assert parse(SERVICES[name])
+
+
+def test_installed_tools_refuse_an_unknown_flag() -> None:
+    command = [*SERVICES["ray-head"]["command"], "--no-such-flag"]
+    with pytest.raises(click.NoSuchOption):
+        parse({"command": command})
+
+
+def test_client_submits_the_full_workflow() -> None:
+    entrypoint = parse(SERVICES["client"])["entrypoint"]
+    assert isinstance(entrypoint, tuple)
+    assert entrypoint[:2] == ("python", "workflows/full.py")
+    assert (ROOT / "workflows" / "full.py").is_file()
+
+
+def test_secrets_are_written_once_and_kept_private(tmp_path: Path) -> None:
+    script = tmp_path / "deploy" / "make-secrets.sh"
+    script.parent.mkdir()
+    script.write_text((ROOT / "deploy" / "make-secrets.sh").read_text())
+    contents = []
+    for _ in range(2):
+        subprocess.run(["sh", str(script)], check=True, env={"PATH": os.environ["PATH"]}, cwd=tmp_path)
+        contents.append({path.name: path.read_text() for path in (script.parent / "secrets").iterdir()})
+    assert contents[0] == contents[1]
+    assert set(contents[0]) == {"ray.env", "postgres.env"}
+    assert re.fullmatch(r"RAY_AUTH_TOKEN=[0-9a-f]{64}\n", contents[0]["ray.env"])
+    assert stat.S_IMODE((script.parent / "secrets" / "ray.env").stat().st_mode) == 0o600
+
+
+def test_secrets_reach_neither_the_repository_nor_an_image_nor_a_job() -> None:
+    # Ray leaves out of a job's upload what a .gitignore names, in whatever folder that .gitignore lies.
+    assert "secrets/" in (ROOT / "deploy" / ".gitignore").read_text().splitlines()
+    assert "deploy/secrets" in (ROOT / ".dockerignore").read_text().splitlines()
+    used = {file for service in SERVICES.values() for file in service.get("env_file", [])}
+    assert used == {"deploy/secrets/ray.env", "deploy/secrets/postgres.env"}
