@@ -1,0 +1,189 @@
+"""The MLflow mirror: what is shown, and that outages, kills and repeats leave neither gaps nor duplicates."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import numpy as np
+import pytest
+
+from datagen.store import open_dataset
+from tests.support.recipes import tiny_training
+from training import tracking
+from training.journal import Journal
+from training.record import begin_record, end_record, find_records, flatten, update_record
+from training.tracking import ALIAS, EXPERIMENT, Mirror, Server, TrackingError, publish
+from training.trainer import train
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An MLflow database with its tables, which take seconds to make."""
+    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
+    mlflow.MlflowClient(f"sqlite:///{path}").search_experiments()
+    return path
+
+
+@pytest.fixture
+def server(empty_store: Path, tmp_path: Path) -> Server:
+    (tmp_path / "mlflow.db").write_bytes(empty_store.read_bytes())
+    return Server(f"sqlite:///{tmp_path / 'mlflow.db'}", artifacts=tmp_path / "mlartifacts")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A workflow's folder with a parent record, a child, metrics and an artifact."""
+    root = tmp_path / "workflow"
+    begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    journal = Journal(root / "run" / "metrics.jsonl")
+    for step in range(1, 6):
+        journal.write(step, {"loss/total": 1 / step, "learning_rate": 0.1})
+    journal.close()
+    (root / "run" / "figures").mkdir()
+    (root / "run" / "figures" / "curve.png").write_bytes(b"png")
+    update_record(root / "run", artifacts=["figures"], metrics={"final": 0.5})
+    return root
+
+
+def runs_of(server: Server) -> dict[str, Any]:
+    client = mlflow.MlflowClient(server.uri)
+    experiment = client.get_experiment_by_name(EXPERIMENT)
+    return {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+
+
+def history(server: Server, run: Any, key: str) -> list[tuple[int, float]]:
+    points = mlflow.MlflowClient(server.uri).get_metric_history(run.info.run_id, key)
+    return sorted((point.step, point.value) for point in points)
+
+
+def test_parent_child_parameters_metrics_artifacts_status(root: Path, server: Server) -> None:
+    end_record(root / "run", "FINISHED")
+    end_record(root, "FAILED")
+    publish(root, server)
+    runs = runs_of(server)
+    parent, child = runs["quick"], runs["train"]
+    assert child.data.tags["mlflow.parentRunId"] == parent.info.run_id
+    assert (parent.info.status, child.info.status) == ("FAILED", "FINISHED")
+    assert child.data.params == {"batch": "8"} and child.data.metrics["final"] == 0.5
+    assert history(server, child, "loss/total") == [(step, 1 / step) for step in range(1, 6)]
+    assert [a.path for a in mlflow.MlflowClient(server.uri).list_artifacts(child.info.run_id, "figures")] == [
+        "figures/curve.png"
+    ]
+
+
+def test_repeating_changes_nothing(root: Path, server: Server) -> None:
+    for _ in range(3):
+        publish(root, server)
+    child = runs_of(server)["train"]
+    assert len(runs_of(server)) == 2
+    assert len(history(server, child, "loss/total")) == 5 and len(history(server, child, "final")) == 1
+
+
+def test_going_on_appends_to_the_same_run(root: Path, server: Server) -> None:
+    publish(root, server)
+    journal = Journal(root / "run" / "metrics.jsonl")
+    journal.write(5, {"loss/total": 99.0})
+    journal.write(6, {"loss/total": 0.1})
+    journal.close()
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    publish(root, server)
+    child = runs_of(server)["train"]
+    assert [step for step, _ in history(server, child, "loss/total")] == [1, 2, 3, 4, 5, 6]
+
+
+def test_killed_between_sending_and_noting(root: Path, server: Server) -> None:
+    """The note of what was sent is lost; sending it all again leaves every point once."""
+    publish(root, server)
+    note = root / "run" / "mlflow.json"
+    state = json.loads(note.read_text())
+    state[server.uri]["offsets"] = {}
+    note.write_text(json.dumps(state))
+    publish(root, server)
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
+def test_an_outage_is_one_error_and_made_up_for_later(
+    root: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with pytest.raises(TrackingError, match=r"MLflow at http://127.0.0.1:9 .*Nothing is lost: dsffnet sync"):
+        publish(root, Server("http://127.0.0.1:9"))
+    publish(root, server)
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
+def test_outage_in_the_middle_of_sending(root: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mlflow.exceptions import MlflowException
+
+    monkeypatch.setattr(tracking, "_METRICS_AT_ONCE", 4)
+    real, calls = mlflow.MlflowClient.log_batch, iter(range(100))
+
+    def flaky(*arguments: Any, **keywords: Any) -> Any:
+        if keywords.get("metrics") and next(calls) == 1:
+            raise MlflowException("the server went away")
+        return real(*arguments, **keywords)
+
+    monkeypatch.setattr(mlflow.MlflowClient, "log_batch", flaky)
+    with pytest.raises(TrackingError, match="the server went away"):
+        publish(root, server)
+    publish(root, server)
+    child = runs_of(server)["train"]
+    assert len(history(server, child, "loss/total")) == len(history(server, child, "learning_rate")) == 5
+
+
+def test_the_mirror_says_an_outage_once_and_never_raises(root: Path, caplog, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    mirror = Mirror(root, Server("http://127.0.0.1:9"), every=0.01)
+    mirror.start()
+    outage = mirror.close()
+    assert isinstance(outage, TrackingError)
+    assert caplog.text.count("does not answer") == 1
+
+
+def test_syncing_a_child_alone_brings_its_parent(root: Path, server: Server) -> None:
+    assert [os.path.basename(folder) for folder in find_records(root / "run")] == ["workflow", "run"]
+    publish(root / "run", server)
+    assert set(runs_of(server)) == {"quick", "train"}
+
+
+def test_another_server_gets_runs_of_its_own(root: Path, server: Server, empty_store: Path, tmp_path: Path) -> None:
+    second = Server(f"sqlite:///{tmp_path / 'second.db'}", artifacts=tmp_path / "second")
+    (tmp_path / "second.db").write_bytes(empty_store.read_bytes())
+    publish(root, server)
+    publish(root, second)
+    assert len(runs_of(second)) == 2 == len(runs_of(server))
+
+
+def test_a_run_deleted_on_the_server_is_made_again(root: Path, server: Server) -> None:
+    publish(root, server)
+    mlflow.MlflowClient(server.uri).delete_run(runs_of(server)["train"].info.run_id)
+    publish(root, server)
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
+def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Server) -> None:
+    """The registered model loads by alias and poses a mesh; the dataset shows as the run's input."""
+    run, opened = tmp_path / "run", open_dataset(dataset)
+    train(tiny_training(), data=dataset, run=run)
+    begin_record(run, name="train", kind="train", parent=None, parameters={})
+    about = {"name": "leg.zarr", "uuid": opened.uuid, "manifest_sha256": opened.attributes["manifest_sha256"]}
+    update_record(run, model="dsffnet", dataset=about)
+    end_record(run, "FINISHED")
+    publish(run, server)
+    mlflow.set_tracking_uri(server.uri)
+    model = mlflow.pyfunc.load_model(f"models:/dsffnet@{ALIAS}")
+    source, target = opened.vertices(0, 0), opened.vertices(1, 3)
+    pair = {"source": source.astype(float), "target": target.astype(float)}
+    posed = model.predict(pair | {"target_faces": opened.faces(1).astype(np.int64)})
+    assert posed.shape == target.shape and np.isfinite(posed).all()
+    (given,) = runs_of(server)["train"].inputs.dataset_inputs
+    assert given.dataset.digest == about["manifest_sha256"][:36] and given.dataset.name == "leg.zarr"
+    publish(run, server)
+    assert len(mlflow.MlflowClient(server.uri).search_model_versions("name='dsffnet'")) == 1
+
+
+def test_flatten() -> None:
+    assert flatten({"a": {"b": 1, "c": {"d": (2, 3)}}, "e": None}) == {"a.b": "1", "a.c.d": "(2, 3)", "e": "None"}
