@@ -15,11 +15,24 @@ from datagen.mesh import write_atomically
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 FILE = "record.json"
+EXPERIMENT = "dsffnet"
+MODEL, ALIAS = "dsffnet", "latest-trained"
+
+
+@dataclass(frozen=True)
+class Server:
+    """Where to mirror to: MLflow tracking URI, and where artifacts go if this creates the experiment (a local path)."""
+
+    uri: str
+    artifacts: Path | None = None
 
 
 @dataclass(frozen=True)
 class Record:
-    """One run as MLflow will show it. ``parent`` and ``artifacts`` are paths relative to the record's folder."""
+    """One run as MLflow will show it. ``parent`` and ``artifacts`` are paths relative to the record's folder.
+
+    ``model`` is the registered name of the run's weights; it is registered again when ``model_version`` changes.
+    """
 
     name: str
     kind: str
@@ -29,6 +42,7 @@ class Record:
     dataset: dict[str, str] | None = None
     artifacts: list[str] = field(default_factory=list)
     model: str | None = None
+    model_version: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
     status: Status = "RUNNING"
     started: int = 0

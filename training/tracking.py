@@ -15,15 +15,13 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
-from training.checkpoint import export_weights, require_checkpoint
 from training.journal import journal_from
-from training.record import Record, find_records, read_record
+from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, read_record
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
@@ -32,22 +30,12 @@ os.environ.setdefault("MLFLOW_SKIP_PIP_REQUIREMENTS_CHECK", "true")
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 log = logging.getLogger(__name__)
-EXPERIMENT = "dsffnet"
-MODEL, ALIAS = "dsffnet", "latest-trained"
 _PARENT_TAG = "mlflow.parentRunId"
 _METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER = 900, 90, 5000
 
 
 class TrackingError(DsffnetError):
     """The tracking server cannot be reached, or refuses; nothing is lost, it can be sent later."""
-
-
-@dataclass(frozen=True)
-class Server:
-    """Where to mirror to: MLflow tracking URI, and where artifacts go if this creates the experiment (a local path)."""
-
-    uri: str
-    artifacts: Path | None = None
 
 
 def publish(root: Path, server: Server) -> None:
@@ -184,6 +172,8 @@ class _Publication:
     def _register_model(self) -> None:
         import mlflow
 
+        from training.checkpoint import export_weights, require_checkpoint
+
         assert self.record.model is not None
         checkpoint = require_checkpoint(self.folder)
         packages = [Path(__file__).parent, Path(__file__).parents[1] / "datagen"]
@@ -211,7 +201,7 @@ class _Publication:
 
     def _once(self, key: str, send: Any) -> None:
         digest = hashlib.sha256(json.dumps([self.record.parameters, self.record.dataset]).encode()).hexdigest()
-        value = digest if key != "model" else str(require_checkpoint(self.folder).step)
+        value = digest if key != "model" else self.record.model_version
         if self.sent.get(key) != value:
             send()
             self._note(**{key: value})

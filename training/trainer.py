@@ -31,7 +31,6 @@ from training.losses import pose_transfer_loss
 from training.metrics import point_mesh_distance
 from training.recipe import TrainingRecipe
 
-
 _LOCK_SECONDS = 30.0  # how long to wait for the ranks of a killed driver to be gone
 
 

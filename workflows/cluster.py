@@ -18,7 +18,7 @@ def on_cluster() -> bool:
 
 
 if not on_cluster():
-    # Ray's own default for a cluster of ours; said before Ray is first imported, which is when it reads it, it is silent.
+    # Ray's own default for a cluster of ours. Ray reads it when it is first imported, and warns if it is not said.
     os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 

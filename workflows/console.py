@@ -10,9 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datagen.errors import DsffnetError, RecipeError
-from datagen.generate import remove
-from training.record import read_record
-from training.tracking import ALIAS, EXPERIMENT, MODEL, Server
+from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
 from workflows.recipe import describe_fields, known_recipes
 
 _OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr")
@@ -120,6 +118,8 @@ def start_over(out: Path) -> None:
     RecipeError
         The folder does not look like a workflow's.
     """
+    from datagen.generate import remove
+
     if not out.exists():
         return
     if any(out.iterdir()) and not (out / "recipe.yaml").exists():

@@ -24,10 +24,9 @@ from training.figures import contact_sheet
 from training.inference import load_trained
 from training.launch import launch
 from training.recipe import EvaluationRecipe, TrainingRecipe
-from training.record import begin_record, end_record, flatten, update_record
+from training.record import MODEL, begin_record, end_record, flatten, update_record
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
-from training.tracking import MODEL
 from workflows.progress import bar, following, sampling
 
 METHOD = "DSFFNet"
@@ -82,7 +81,9 @@ def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | 
             launch(recipe, data=data, run=run)
         draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
         artifacts = ["recipe.yaml", "provenance.json", "metrics.jsonl", "figures"]
-        update_record(run, artifacts=artifacts, model=MODEL)
+        update_record(
+            run, artifacts=artifacts, model=MODEL, model_version=f"{dataset.uuid} step {last_step(recipe, dataset)}"
+        )
 
 
 def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Path | None) -> str:

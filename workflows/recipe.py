@@ -47,7 +47,7 @@ def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRec
     try:
         merged = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(list(overrides)))
         values = OmegaConf.to_container(merged, resolve=True)
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
         raise RecipeError(f"recipe {path} cannot be read: {error}") from error
     return check_recipe(values, where=str(name_or_file))
 

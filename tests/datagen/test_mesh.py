@@ -63,7 +63,7 @@ def test_missing_unknown_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="no mesh file at"):
         load_mesh(tmp_path / "none.obj")
     (tmp_path / "a.fbx").write_text("x")
-    with pytest.raises(MeshError, match="unknown mesh format '.fbx'"):
+    with pytest.raises(MeshError, match=r"unknown mesh format '\.fbx'"):
         load_mesh(tmp_path / "a.fbx")
     (tmp_path / "a.glb").write_bytes(b"not a glb at all")
     with pytest.raises(MeshError, match="cannot be read as a GLB"):

@@ -84,7 +84,9 @@ def test_bit_flip_in_a_shard_is_an_error_and_never_wrong_data(spoilable: Path, a
 
 
 @pytest.mark.parametrize("spoil", [flip_bit, truncate, Path.unlink])
-def test_repair_brings_the_very_same_bytes_back_and_touches_no_other_shard(dataset: str, spoilable: Path, spoil) -> None:
+def test_repair_brings_the_very_same_bytes_back_and_touches_no_other_shard(
+    dataset: str, spoilable: Path, spoil
+) -> None:
     others = {path: path.stat().st_mtime_ns for path in spoilable.rglob("c/*/0/0")}
     spoil(first_shard(spoilable))
     others.pop(first_shard(spoilable))
@@ -112,7 +114,7 @@ def test_unfinished_dataset_is_refused_but_can_be_described(spoilable: Path) -> 
 
 
 def test_no_dataset_there(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="no dataset at .*dsffnet generate"):
+    with pytest.raises(DatasetError, match=r"no dataset at .*dsffnet generate"):
         open_dataset(str(tmp_path / "none.zarr"))
 
 
@@ -178,7 +180,9 @@ def test_statistics_are_those_of_all_meshes(dataset: str) -> None:
     opened = open_dataset(dataset)
     everything = np.concatenate([opened.vertices(i).reshape(-1, 3) for i in range(5)])
     statistics = attributes_of(opened.group)["statistics"]
-    assert np.allclose(statistics["minimum"], everything.min(0)) and np.allclose(statistics["maximum"], everything.max(0))
+    assert np.allclose(statistics["minimum"], everything.min(0)) and np.allclose(
+        statistics["maximum"], everything.max(0)
+    )
     assert statistics["meshes"] == opened.grid.mesh_count == 38
 
 

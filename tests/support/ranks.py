@@ -21,13 +21,24 @@ def free_port() -> int:
 
 
 def start_ranks(
-    recipe: TrainingRecipe, *, data: str, run: Path, count: int, module: str = "training.launch", log: Path | None = None
+    recipe: TrainingRecipe,
+    *,
+    data: str,
+    run: Path,
+    count: int,
+    module: str = "training.launch",
+    log: Path | None = None,
 ) -> list[subprocess.Popen[str]]:
     """Start ``count`` ranks of ``python -m module RECIPE DATA RUN``."""
     run.parent.mkdir(parents=True, exist_ok=True)
     path = run.parent / f"{run.name}-recipe.yaml"
     path.write_text(yaml.safe_dump(recipe.model_dump(mode="json")))
-    shared = {"WORLD_SIZE": str(count), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "OMP_NUM_THREADS": "1"}
+    shared = {
+        "WORLD_SIZE": str(count),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(free_port()),
+        "OMP_NUM_THREADS": "1",
+    }
     return [
         subprocess.Popen(
             [sys.executable, "-m", module, str(path), data, str(run)],

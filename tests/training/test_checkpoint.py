@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from datagen.errors import StorageError
+from tests.support.files import flip_bit, truncate
 from training import checkpoint as module
 from training.checkpoint import CheckpointError, export_weights, load_checkpoint, require_checkpoint, save_checkpoint
-from tests.support.files import flip_bit, truncate
 
 
 def save(run: Path, step: int, keep: int = 3) -> Path:
@@ -46,7 +46,7 @@ def test_a_damaged_newest_falls_back_and_says_so(tmp_path: Path, caplog, spoil, 
 def test_none_or_all_damaged(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     flip_bit(save(tmp_path, 1) / "weights.safetensors")
-    with pytest.raises(CheckpointError, match="no usable checkpoint. Train first: dsffnet train"):
+    with pytest.raises(CheckpointError, match=r"no usable checkpoint\. Train first: dsffnet train"):
         require_checkpoint(tmp_path)
 
 

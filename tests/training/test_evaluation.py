@@ -112,7 +112,9 @@ class TestTransfer:
         opened, transfer = open_dataset(dataset), PoseTransfer.from_run(run)
         source, target = (opened.vertices(i, i).astype(float) for i in (0, 1))
         order = np.random.default_rng(0).permutation(len(target))
-        assert np.allclose(transfer.vertices(source, target[order]), transfer.vertices(source, target)[order], atol=1e-5)
+        assert np.allclose(
+            transfer.vertices(source, target[order]), transfer.vertices(source, target)[order], atol=1e-5
+        )
 
     def test_a_perfect_network_restores_the_right_size(self) -> None:
         """With a network that returns the target itself, the output is the target where it was."""

@@ -13,8 +13,8 @@ from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from training import tracking
 from training.journal import Journal
-from training.record import begin_record, end_record, find_records, flatten, update_record
-from training.tracking import ALIAS, EXPERIMENT, Mirror, Server, TrackingError, publish
+from training.record import ALIAS, EXPERIMENT, Server, begin_record, end_record, find_records, flatten, update_record
+from training.tracking import Mirror, TrackingError, publish
 from training.trainer import train
 
 

@@ -176,7 +176,7 @@ def test_ranks_that_cannot_share_the_batch() -> None:
 def test_cuda_where_there_is_none(dataset: str, tmp_path: Path) -> None:
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    with pytest.raises(DsffnetError, match="torch sees no CUDA device. Use --set training.device=cpu"):
+    with pytest.raises(DsffnetError, match=r"torch sees no CUDA device\. Use --set training\.device=cpu"):
         train(tiny_training(device="cuda"), data=dataset, run=tmp_path / "run")
 
 
@@ -184,7 +184,7 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "loss_curve.json"
 
 
 def test_golden_loss_curve(undisturbed: Path) -> None:
-    """A change that should not change numbers proves it here. After a meant change: REGENERATE=1 pytest -k golden_loss"""
+    """A change that should not change numbers proves it. After a meant change: REGENERATE=1 pytest -k golden_loss"""
     found = losses(undisturbed).tolist()
     if os.environ.get("REGENERATE"):
         GOLDEN.write_text(json.dumps(found, indent=1) + "\n")

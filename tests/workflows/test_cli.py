@@ -1,0 +1,144 @@
+"""The ``dsffnet`` command and the workflow script as a person types them: output, one clear error, exit status."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.mesh import Mesh, load_mesh, save_mesh
+from datagen.store import open_dataset
+from tests.support.files import flip_bit
+from tests.support.recipes import tiny_training
+from training.trainer import train
+
+ROOT = Path(__file__).parents[2]
+
+
+def command(*arguments: object, script: str = "dsffnet", **environment: str) -> subprocess.CompletedProcess[str]:
+    start = ["-m", "workflows.cli"] if script == "dsffnet" else [str(ROOT / "workflows" / script)]
+    return subprocess.run(
+        [sys.executable, *start, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=120,
+        env={**os.environ, **environment},
+        check=False,
+    )
+
+
+def fails(result: subprocess.CompletedProcess[str], status: int, *says: str) -> None:
+    """One line on standard error that begins with ``error:``, the status, and no traceback."""
+    assert result.returncode == status, result.stderr
+    errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and "Traceback" not in result.stderr, result.stderr
+    for text in says:
+        assert text in errors[0]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A tiny dataset and a run trained on it."""
+    from datagen.generate import generate
+    from tests.support.recipes import tiny_dataset
+
+    folder = tmp_path_factory.mktemp("trained")
+    generate(tiny_dataset(), str(folder / "leg.zarr"))
+    train(tiny_training(), data=str(folder / "leg.zarr"), run=folder / "run")
+    return folder / "leg.zarr", folder / "run"
+
+
+def test_every_subcommand_has_help_with_an_example() -> None:
+    overview = command("--help").stdout
+    for name in ("generate", "inspect", "verify", "train", "evaluate", "transfer", "sync", "recipe"):
+        assert name in overview
+        assert f"dsffnet {name} " in command(name, "--help").stdout
+    assert "training.learning_rate = 0.001" in command("train", "--help").stdout
+
+
+def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
+    data = tmp_path / "leg.zarr"
+    made = command("generate", "--recipe", "smoke", "--local", "--out", data)
+    assert made.returncode == 0 and "status              complete" in made.stdout
+    picture = tmp_path / "sheet.png"
+    assert (
+        "176 of 96 vertices" in command("inspect", data, "--picture", picture).stdout
+        and picture.stat().st_size > 10_000
+    )
+    assert command("verify", data).stdout.endswith("is whole\n")
+    flip_bit(data / "identity/0002/vertices/c/1/0/0")
+    fails(command("verify", data), 1, "has 1 faults", f"dsffnet verify {data} --repair")
+    assert "identity/0002/vertices/c/1/0/0: its sha256" in command("verify", data).stdout
+    assert "is whole again" in command("verify", data, "--repair").stdout
+    assert command("verify", data).returncode == 0
+
+
+def test_transfer_between_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    data, run = trained
+    opened = open_dataset(str(data))
+    save_mesh(Mesh(opened.vertices(3, 7), opened.faces(3)), tmp_path / "pose.obj")
+    save_mesh(Mesh(opened.vertices(4, 0), opened.faces(4)), tmp_path / "person.ply")
+    paths = ("--source", tmp_path / "pose.obj", "--target", tmp_path / "person.ply", "--out", tmp_path / "posed.glb")
+    result = command("transfer", "--model", run, *paths)
+    assert result.returncode == 0, result.stderr
+    posed = load_mesh(tmp_path / "posed.glb")
+    assert np.array_equal(posed.faces, opened.faces(4)) and len(posed.vertices) == opened.vertices(4, 0).shape[0]
+
+
+def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    _, run = trained
+    (tmp_path / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    (tmp_path / "junk.glb").write_bytes(b"junk")
+    (tmp_path / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+
+    def transfer(source: str, model: Path = run, out: str = "out.obj") -> subprocess.CompletedProcess[str]:
+        target = tmp_path / "good.obj"
+        return command(
+            "transfer", "--model", model, "--source", tmp_path / source, "--target", target, "--out", tmp_path / out
+        )
+
+    fails(transfer("none.obj"), 1, "no mesh file at", "none.obj")
+    fails(transfer("nan.obj"), 1, "nan.obj", "1 vertices are not finite")
+    fails(transfer("points.obj"), 1, "points.obj", "no triangles")
+    fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as a GLB mesh")
+    fails(transfer("good.obj", model=tmp_path / "norun"), 1, "norun has no usable checkpoint")
+    fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_bad_recipes_and_usage_exit_2(tmp_path: Path) -> None:
+    out = tmp_path / "x.zarr"
+    fails(command("generate", "--recipe", "quickstrat", "--out", out), 2, "did you mean 'quickstart'")
+    fails(
+        command("--recipe", "smoke", "--out", tmp_path / "w", "--set", "training.stepz=3", script="full.py"), 2,
+        "unknown key 'training.stepz', did you mean 'training.steps'?",
+    )  # fmt: skip
+    assert command("generate").returncode == 2 and not out.exists() and not (tmp_path / "w").exists()
+
+
+def test_missing_and_unfinished_datasets(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    fails(command("inspect", tmp_path / "no.zarr"), 1, "no dataset at", "dsffnet generate")
+    fails(command("train", "--data", tmp_path / "no.zarr", "--out", tmp_path / "run"), 1, "no dataset at")
+    fails(command("sync", tmp_path), 1, "holds no record of a run")
+
+
+def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
+    result = command("--recipe", "smoke", "--out", "runs/x", script="full.py", RAY_ADDRESS="127.0.0.1:1")
+    fails(result, 2, "--out 'runs/x' is a relative path", "throw-away copy", "--out /data/runs/x")
+    fails(command("--recipe", "smoke", script="full.py", RAY_ADDRESS="127.0.0.1:1"), 2, "relative path")
+
+
+def test_fresh_leaves_other_peoples_files_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    fails(command("--recipe", "smoke", "--out", tmp_path, "--fresh", script="full.py"), 2, "leaves it alone")
+    assert (tmp_path / "thesis.txt").exists()
+
+
+def test_printed_recipe_can_be_used_as_a_file(tmp_path: Path) -> None:
+    printed = command("recipe", "--recipe", "smoke", "--set", "training.seed=4").stdout
+    (tmp_path / "mine.yaml").write_text(printed)
+    assert command("recipe", "--recipe", tmp_path / "mine.yaml").stdout == printed
