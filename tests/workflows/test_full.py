@@ -1,0 +1,193 @@
+"""The whole workflow as a person runs it, undisturbed and under SIGKILL of the driver, of Ray's workers, of a rank."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import torch
+
+from datagen.store import open_dataset
+from tests.support.files import tree_hash
+from training.checkpoint import require_checkpoint
+from training.journal import read_journal
+from training.record import read_record
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(400)]
+ROOT = Path(__file__).parents[2]
+LONGER = ["data.poses.seen=60", "data.poses.unseen=40", "training.steps=500", "training.checkpoint_every=25"]
+
+
+def start(out: Path, *arguments: str, **environment: str) -> subprocess.Popen[str]:
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("RAY_", "MLFLOW_"))}
+    return subprocess.Popen(
+        [sys.executable, "workflows/full.py", "--recipe", "smoke", "--out", str(out), *arguments],
+        cwd=ROOT,
+        env=clean | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def run(out: Path, *arguments: str, **environment: str) -> tuple[int, str]:
+    process = start(out, *arguments, **environment)
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output
+
+
+def longer(out: Path) -> tuple[str, ...]:
+    return ("--set", *LONGER)
+
+
+def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120) -> None:
+    until = time.monotonic() + seconds
+    while not happened():
+        assert process.poll() is None, f"ended before the moment to kill it:\n{process.stdout.read()}"  # type: ignore[union-attr]
+        assert time.monotonic() < until, "the moment to kill it never came"
+        time.sleep(0.01)
+
+
+def family(process: subprocess.Popen[str], title: str) -> list[psutil.Process]:
+    """Ray's processes below the driver whose title holds ``title``."""
+    found = []
+    for child in psutil.Process(process.pid).children(recursive=True):
+        try:
+            if title in " ".join(child.cmdline()):
+                found.append(child)
+        except psutil.Error:
+            continue
+    return found
+
+
+def shards(out: Path) -> int:
+    return len(list((out / "dataset.zarr").rglob("vertices/c/*/0/0")))
+
+
+def trained_steps(out: Path) -> int:
+    rows = read_journal(out / "run" / "metrics.jsonl")
+    return int(rows[-1]["step"]) if rows else 0
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    status, output = run(out, *longer(out))
+    assert status == 0, output
+    yield out
+
+
+def assert_equal(out: Path, undisturbed: Path) -> None:
+    """The same dataset and the same trained weights, to the bit, and one line a step in the journal."""
+    assert tree_hash(out / "dataset.zarr") == tree_hash(undisturbed / "dataset.zarr")
+    one, other = (require_checkpoint(folder / "run").weights() for folder in (out, undisturbed))
+    assert all(torch.equal(one[name], other[name]) for name in other)
+    steps = [row["step"] for row in read_journal(out / "run" / "metrics.jsonl")]
+    assert steps == [row["step"] for row in read_journal(undisturbed / "run" / "metrics.jsonl")]
+
+
+def test_outputs_closing_words_and_records(undisturbed: Path) -> None:
+    evaluation = undisturbed / "run" / "evaluation"
+    for name in ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png"):
+        assert (evaluation / name).stat().st_size > 500, name
+    assert len(list((evaluation / "meshes").glob("*.glb"))) == 16
+    for folder, kind in ((".", "workflow"), ("generate", "generate"), ("run", "train"), ("run/evaluation", "evaluate")):
+        record = read_record(undisturbed / folder)
+        assert record is not None and (record.kind, record.status) == (kind, "FINISHED")
+
+
+def test_run_again_every_stage_is_skipped_in_seconds(undisturbed: Path) -> None:
+    before = tree_hash(undisturbed / "run")
+    began = time.monotonic()
+    status, output = run(undisturbed, *longer(undisturbed))
+    assert status == 0 and output.count("skipped, finished before") == 3
+    assert "Where everything lies" in output and "dsffnet transfer --model" in output
+    assert time.monotonic() - began < 30 and tree_hash(undisturbed / "run") == before
+
+
+def test_mlflow_shows_one_parent_three_children_and_a_loadable_model(undisturbed: Path) -> None:
+    import mlflow
+
+    uri = f"sqlite:///{undisturbed / 'mlflow.db'}"
+    client = mlflow.MlflowClient(uri)
+    runs = client.search_runs([client.get_experiment_by_name("dsffnet").experiment_id])
+    (parent,) = [r for r in runs if r.data.tags["kind"] == "workflow"]
+    children = {r.data.tags["kind"]: r for r in runs if r.data.tags.get("mlflow.parentRunId") == parent.info.run_id}
+    assert set(children) == {"generate", "train", "evaluate"}
+    assert {r.info.status for r in runs} == {"FINISHED"}
+    assert children["train"].data.params["batch"] == "4" and "pmd_unseen" in children["evaluate"].data.metrics
+    assert any(key.startswith("system/") for r in runs for key in r.data.metrics)
+    assert children["train"].inputs.dataset_inputs
+    mlflow.set_tracking_uri(uri)
+    model = mlflow.pyfunc.load_model("models:/dsffnet@latest-trained")
+    dataset = open_dataset(str(undisturbed / "dataset.zarr"))
+    meshes = {"source": dataset.vertices(4, 0), "target": dataset.vertices(5, 1), "target_faces": dataset.faces(5)}
+    posed = model.predict({name: values.astype("int64" if "faces" in name else float) for name, values in meshes.items()})
+    assert posed.shape == meshes["target"].shape
+
+
+def test_sigkill_of_the_driver_in_every_stage(undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    moments = [
+        lambda: shards(out) >= 5,
+        lambda: (out / "stages" / "generate.json").exists(),
+        lambda: trained_steps(out) >= 60,
+        lambda: (out / "run" / "evaluation" / "record.json").exists(),
+    ]
+    for moment in moments:
+        process = start(out, *longer(out))
+        wait_for(moment, process)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    status, output = run(out, *longer(out))
+    assert status == 0, output
+    assert_equal(out, undisturbed)
+
+
+def test_sigkill_of_ray_workers_while_generating(undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = start(out, *longer(out))
+    for count in (2, 12):
+        wait_for(lambda count=count: shards(out) >= count and bool(family(process, "ray::ensure_shard")), process)  # type: ignore[misc]
+        for worker in family(process, "ray::ensure_shard"):
+            worker.send_signal(signal.SIGKILL)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert_equal(out, undisturbed)
+
+
+def test_sigkill_of_a_training_rank(undisturbed: Path, tmp_path: Path) -> None:
+    """The group starts again by itself, from the newest checkpoint, and ends equal to an undisturbed training."""
+    out = tmp_path / "out"
+    process = start(out, *longer(out))
+    wait_for(lambda: trained_steps(out) >= 60, process)
+    ranks = family(process, "ray::RayTrainWorker")
+    assert len(ranks) == 2, [p.cmdline() for p in psutil.Process(process.pid).children(recursive=True)]
+    ranks[1].send_signal(signal.SIGKILL)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert_equal(out, undisturbed)
+
+
+def test_tracking_server_down_costs_nothing_but_the_exit_status(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    status, output = run(out, "--tracking-uri", "http://127.0.0.1:9")
+    assert status == 1 and output.count("error: MLflow at http://127.0.0.1:9 does not answer") == 1, output
+    assert "Nothing is lost" in output and (out / "run" / "evaluation" / "tables.md").exists()
+    sync = [sys.executable, "-m", "workflows.cli", "sync", str(out), "--tracking-uri", f"sqlite:///{tmp_path / 'later.db'}"]
+    done = subprocess.run(sync, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0 and "is up to date" in done.stdout, done.stderr
+    assert len(json.loads((out / "mlflow.json").read_text())) == 1
+
+
+def test_more_ranks_than_cpus(tmp_path: Path) -> None:
+    ranks = 2 * (os.cpu_count() or 1) + 2
+    status, output = run(tmp_path / "out", "--set", f"training.ranks={ranks}", f"training.batch={ranks}")
+    assert status == 1 and output.count("error: ") == 1, output
+    assert f"training.ranks is {ranks}, but the cluster has" in output and "--set training.ranks=" in output
