@@ -14,7 +14,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from training.rendering import Camera, Floats, Integers, MeshLike, frame, render_mesh
+from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.rasteriser import Floats, Integers
+from training.rendering import Camera, MeshLike, frame, render_mesh
 
 ROLE_COLORS: Mapping[str, tuple[float, float, float]] = {
     "source": (0.36, 0.55, 0.82),
@@ -32,9 +34,6 @@ COLUMNS = (
 ERROR_COLORS = colormaps["magma_r"](np.linspace(0.03, 0.86, 256))[:, :3]
 ERROR_MAP = ListedColormap(ERROR_COLORS, name="error")
 _SHEET_HUES = ("#5B8CD1", "#E8995A", "#55A98F", "#B98BC6", "#D0AE48", "#CE7474")
-_DPI = 200
-_INK, _QUIET, _RULE = "#1d2430", "#6b7483", "#e3e6ea"
-_PAGE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -129,19 +128,19 @@ def transfer_figure(
     for column, (header, meaning) in enumerate(COLUMNS):
         middle = 20 + (column + 0.5) * panel[0]
         page.text(middle, 44, header, size=10, weight="bold", anchor="center")
-        page.text(middle, 82, meaning, size=7, color=_QUIET, anchor="center")
+        page.text(middle, 82, meaning, size=7, color=QUIET, anchor="center")
     for index, example in enumerate(rows):
         top = 110 + index * (panel[1] + 46)
         page.rule(top)
         page.text(24, top + 27, example.title, size=7.5)
-        page.text(page.width - 24, top + 27, example.metrics, size=7.5, color=_QUIET, anchor="right")
+        page.text(page.width - 24, top + 27, example.metrics, size=7.5, color=QUIET, anchor="right")
         for column, picture in enumerate(_row_pictures(example, scale, limit, panel)):
             page.picture(picture, 20 + column * panel[0], top + 46)
     page.rule(page.height - 112)
     left = 20 + 4 * panel[0]
     bar = page.figure.add_axes(page.box(left + 18, page.height - 92, panel[0] - 36, 18))
     _colorbar(page.figure, bar, limit, f"per-vertex error ({scale.unit})")
-    return _saved(page.figure, path)
+    return saved(page.figure, path)
 
 
 def contact_sheet(
@@ -180,9 +179,9 @@ def contact_sheet(
         page.text(38, top + panel[1] / 2, row_labels[index], size=7.5, anchor="center", rotation=90, weight="bold")
         hue = _hex(_SHEET_HUES[index % len(_SHEET_HUES)])
         for column, vertices in enumerate(row):
-            picture = render_mesh(vertices, faces, colors=hue, camera=camera, size=panel, background=_PAGE)
+            picture = render_mesh(vertices, faces, colors=hue, camera=camera, size=panel, background=PAGE)
             page.picture(picture, 70 + column * panel[0], top)
-    return _saved(page.figure, path)
+    return saved(page.figure, path)
 
 
 @dataclass(frozen=True)
@@ -196,7 +195,7 @@ class _Page:
 
     def __init__(self, *, width: int, height: int) -> None:
         self.width, self.height = width, height
-        self.figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor=_PAGE)
+        self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAGE)
 
     def box(self, left: float, top: float, width: float, height: float) -> tuple[float, float, float, float]:
         """Return a rectangle as matplotlib counts it."""
@@ -205,12 +204,12 @@ class _Page:
     def text(self, x: float, y: float, words: str, *, size: float, anchor: str = "left", **style: Any) -> None:
         """Write words, vertically centred at y; `parse_math` off, for names may hold dollar signs."""
         where = x / self.width, 1 - y / self.height
-        style = {"color": _INK, "parse_math": False, **style}
+        style = {"color": INK, "parse_math": False, **style}
         self.figure.text(*where, words, fontsize=size, ha=anchor, va="center", **style)
 
     def rule(self, y: float) -> None:
         """Draw a hairline across the page."""
-        self.figure.add_axes(self.box(20, y, self.width - 40, 1), facecolor=_RULE, xticks=[], yticks=[], frame_on=True)
+        self.figure.add_axes(self.box(20, y, self.width - 40, 1), facecolor=RULE, xticks=[], yticks=[], frame_on=True)
         for spine in self.figure.axes[-1].spines.values():
             spine.set_visible(False)
 
@@ -235,7 +234,7 @@ def _picture(
     mesh: MeshLike, colors: npt.ArrayLike, camera: Camera, size: tuple[int, int], shading: float = 1.0
 ) -> npt.NDArray[np.uint8]:
     return render_mesh(
-        mesh.vertices, mesh.faces, colors=colors, camera=camera, size=size, background=_PAGE, shading=shading
+        mesh.vertices, mesh.faces, colors=colors, camera=camera, size=size, background=PAGE, shading=shading
     )
 
 
@@ -253,127 +252,6 @@ def _colorbar(figure: Figure, axes: Axes, limit: float, label: str) -> None:
         ScalarMappable(Normalize(0, limit), ERROR_MAP), cax=axes, orientation="horizontal", extend="max"
     )
     bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=6.5, colors=_INK, length=2, width=0.5, pad=2)
+    bar.ax.tick_params(labelsize=6.5, colors=INK, length=2, width=0.5, pad=2)
     bar.ax.locator_params(nbins=4)
-    bar.set_label(label, fontsize=7, color=_INK, labelpad=2)
-
-
-def _saved(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write under a temporary name and rename, so that a reader never meets half a picture."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        figure.savefig(temporary, format="png", dpi=_DPI)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
-
-
-def training_curve(
-    journal_rows: Sequence[Mapping[str, float]],
-    path: str | os.PathLike[str],
-    *,
-    baselines: Mapping[str, float] | None = None,
-) -> Path:
-    """Draw losses and evaluation PMD over steps on log scales, and the learning rate as a strip below.
-
-    Parameters
-    ----------
-    journal_rows : sequence of dict
-        ``step`` and any of ``loss/*``, ``evaluation/pmd*``, ``learning_rate``; missing, non-finite and non-positive
-        values are left out.
-    path : path of the PNG to write
-    baselines : dict, optional
-        Name -> PMD of doing nothing, drawn as dashed lines.
-    """
-    losses = _keys(journal_rows, "loss/")
-    evaluations = _keys(journal_rows, "evaluation/pmd")
-    rates = _keys(journal_rows, "learning_rate")
-    panels = [("loss", losses, 3.0), ("PMD", evaluations, 2.4), ("learning\nrate", rates, 0.55)]
-    panels = [panel for panel in panels if panel[1]]
-    if not panels:
-        raise ValueError("the journal holds no finite loss, evaluation or learning rate to draw")
-    heights = [panel[2] for panel in panels]
-    figure = Figure(figsize=(8, sum(heights) * 0.95 + 0.5), dpi=_DPI, facecolor=_PAGE, layout="constrained")
-    all_axes = figure.subplots(len(panels), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    for axes, (label, keys, _) in zip(all_axes, panels, strict=True):
-        _styled(axes, label)
-        if label.startswith("learning"):
-            axes.fill_between(*_series(journal_rows, keys[0]), color="#cfd6df", linewidth=0)
-            axes.set_ylim(bottom=0)
-            axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
-            continue
-        _draw_terms(axes, journal_rows, keys, dots=label == "PMD")
-        _draw_baselines(axes, (baselines or {}) if label == "PMD" else {})
-        axes.set_yscale("log")
-        place = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0.1}
-        axes.legend(fontsize=7, frameon=False, ncols=6, labelcolor=_INK, **place)
-    all_axes[-1].set_xlabel("step", fontsize=8, color=_INK)
-    return _saved(figure, path)
-
-
-_TERM_COLORS = ("#1d2430", "#3f74c8", "#e08b3c", "#2f9e83", "#a868b8", "#c25b5b", "#8a8f3a", "#5aa9c9")
-
-
-def _keys(rows: Sequence[Mapping[str, float]], prefix: str) -> list[str]:
-    """Return the keys with a drawable value, totals first."""
-    names = {key for row in rows for key in row if key.startswith(prefix)}
-    drawable = [name for name in names if len(_series(rows, name)[0])]
-    return sorted(drawable, key=lambda name: (not name.endswith("total"), name))
-
-
-def _series(rows: Sequence[Mapping[str, float]], key: str) -> tuple[Floats, Floats]:
-    """Return steps and values of one key, in order of step, without what a log scale cannot show."""
-    pairs = np.array([(row["step"], row[key]) for row in rows if row.get(key) is not None and "step" in row], float)
-    pairs = pairs.reshape(-1, 2)
-    pairs = pairs[np.isfinite(pairs).all(1) & (pairs[:, 1] > 0)]
-    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
-    return pairs[:, 0], pairs[:, 1]
-
-
-def _smooth(values: Floats) -> Floats:
-    """Return a running geometric mean over about a fiftieth of the series, centred."""
-    reach = max(len(values) // 50, 1)
-    sums = np.cumsum(np.concatenate([[0.0], np.log(values)]))
-    index = np.arange(len(values))
-    low, high = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(values))
-    return np.asarray(np.exp((sums[high] - sums[low]) / (high - low)))
-
-
-def _styled(axes: Axes, label: str) -> None:
-    axes.set_ylabel(label, fontsize=8, color=_INK)
-    axes.tick_params(labelsize=7, colors=_QUIET, which="both", width=0.5)
-    axes.yaxis.get_offset_text().set_fontsize(6.5)
-    axes.grid(True, which="major", color=_RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.margins(x=0.01)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#b9c0c9")
-
-
-def _draw_terms(axes: Axes, rows: Sequence[Mapping[str, float]], keys: Sequence[str], *, dots: bool) -> None:
-    colors = _TERM_COLORS[1:] if dots else _TERM_COLORS
-    for index, key in enumerate(keys):
-        steps, values = _series(rows, key)
-        style: dict[str, Any] = {
-            "color": colors[index % len(colors)],
-            "label": key.split("/", 1)[-1].removeprefix("pmd_").replace("_", " "),
-        }
-        if dots:
-            axes.plot(steps, values, linewidth=1.6, marker="o", markersize=3, **style)
-        else:
-            axes.plot(steps, values, linewidth=0.5, alpha=0.28, color=style["color"])
-            axes.plot(steps, _smooth(values), linewidth=1.8, **style)
-
-
-def _draw_baselines(axes: Axes, baselines: Mapping[str, float]) -> None:
-    for name, value in baselines.items():
-        if np.isfinite(value) and value > 0:
-            axes.axhline(value, color=_QUIET, linewidth=0.9, linestyle=(0, (5, 3)))
-            axes.annotate(
-                name, (1, value), xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points",
-                ha="right", fontsize=7, color=_QUIET, parse_math=False,
-            )  # fmt: skip
+    bar.set_label(label, fontsize=7, color=INK, labelpad=2)

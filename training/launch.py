@@ -10,8 +10,9 @@ from typing import Any
 
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
+from training.ranks import TrainingError
 from training.recipe import TrainingRecipe
-from training.trainer import TrainingError, train
+from training.trainer import train
 
 _RESTARTS, _FAILURE = 3, "failure.json"
 

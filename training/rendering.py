@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-Floats = npt.NDArray[np.floating]
-Integers = npt.NDArray[np.integer]
+from training.rasteriser import Floats, Integers, on_plane, planes, rasterise
 
 CLAY = (0.72, 0.74, 0.78)
 BACKGROUND = (0.975, 0.978, 0.982)
@@ -20,9 +19,6 @@ _SUPERSAMPLE = 3
 _SKY_LIGHTS = 20
 _SHADOW_PIXELS = 96
 _GROUND_PIXELS = 96
-_CANDIDATES_AT_ONCE = 1 << 21  # bounds memory when triangles are large on screen
-_LEVELS = 2**31 - 1  # of depth; a pixel keeps the least of (depth level, face) packed into 64 bits
-_EMPTY = np.iinfo(np.int64).max
 
 
 class MeshLike(Protocol):
@@ -192,7 +188,7 @@ def ground_shadow(vertices: Floats, faces: Integers) -> tuple[Floats, Floats, fl
     side = float((high - low)[[0, 2]].max() + 0.8 * tall)
     corner = ((low + high)[[0, 2]] - side) / 2
     from_below = np.stack([vertices[:, 0] - corner[0], vertices[:, 2] - corner[1], low[1] - vertices[:, 1]], 1)
-    _, nearness = _rasterise(
+    _, nearness = rasterise(
         from_below * (_GROUND_PIXELS / side, _GROUND_PIXELS / side, 1), faces, *2 * [_GROUND_PIXELS]
     )
     height = -nearness.reshape(_GROUND_PIXELS, _GROUND_PIXELS) / tall
@@ -276,7 +272,7 @@ def _visible(vertices: Floats, faces: Integers, points: Floats, direction: Float
     mesh, points = vertices @ axes.T, points @ axes.T
     low, extent = mesh.min(0), max(float(np.ptp(mesh, axis=0).max()), 1e-9)
     scale = np.array([_SHADOW_PIXELS / extent, _SHADOW_PIXELS / extent, 1.0])
-    _, nearest = _rasterise((mesh - low) * scale, faces, _SHADOW_PIXELS, _SHADOW_PIXELS)
+    _, nearest = rasterise((mesh - low) * scale, faces, _SHADOW_PIXELS, _SHADOW_PIXELS)
     at = np.floor((points - low) * scale)[:, :2].astype(int)
     inside = ((at >= 0) & (at < _SHADOW_PIXELS)).all(1)
     at = np.where(inside[:, None], at, 0)
@@ -314,11 +310,11 @@ def _supersampled(
         [width / 2 + focal * in_view[:, 0] / away, height / 2 - focal * in_view[:, 1] / away, 1 / away], 1
     )
     ahead = faces[(-in_view[faces, 2] > 1e-6).all(1)]
-    owner, _ = _rasterise(screen, ahead, width, height)
+    owner, _ = rasterise(screen, ahead, width, height)
     pixels = np.flatnonzero(owner >= 0)
     owner = owner[pixels]
-    planes, facing = _planes(screen, ahead)
-    one, two = (_on_plane(plane, owner, pixels % width + 0.5, pixels // width + 0.5) for plane in planes[:2])
+    plane_of, facing = planes(screen, ahead)
+    one, two = (on_plane(plane, owner, pixels % width + 0.5, pixels // width + 0.5) for plane in plane_of[:2])
     weights = np.stack([1 - one - two, one, two]) * screen[ahead[owner], 2].T
     weights /= weights.sum(0)
     surface = np.asarray(sum(weights[k, :, None] * attributes[ahead[owner, k]] for k in range(3)))
@@ -342,62 +338,3 @@ def _lighting(normals: Floats, opening: Floats, axes: Floats) -> tuple[Floats, F
     gloss = np.maximum(normals @ (half / np.linalg.norm(half)), 0) ** 28
     diffuse = 1.0 * key * (0.3 + 0.7 * opening) + (0.3 + 0.16 * normals[:, 1]) * opening**1.6 + 0.1 * fill
     return diffuse, 0.07 * gloss * opening
-
-
-def _planes(screen: Floats, faces: Integers) -> tuple[Floats, Floats]:
-    """Return two barycentric weights and nearness of faces as planes over the screen [3, 3, f], and doubled area."""
-    origin = screen.T[:, faces[:, 0]]
-    first, second = screen.T[:, faces[:, 1]] - origin, screen.T[:, faces[:, 2]] - origin
-    area = first[0] * second[1] - first[1] * second[0]
-    safe = np.where(np.abs(area) > 1e-12, area, np.inf)
-    one = np.stack([second[1], -second[0]]) / safe
-    two = np.stack([-first[1], first[0]]) / safe
-    slopes = np.stack([one, two, one * first[2] + two * second[2]])
-    offset = -(slopes * origin[:2]).sum(1)
-    offset[2] += origin[2]
-    return np.concatenate([slopes, offset[:, None]], 1), area
-
-
-def _on_plane(plane: Floats, owner: Integers, x: Floats, y: Floats) -> Floats:
-    """Return the value at points on the screen [p] of the planes [3, f] of their faces."""
-    return np.asarray(plane[0][owner] * x + plane[1][owner] * y + plane[2][owner])
-
-
-def _boxes(screen: Floats, faces: Integers, limit: npt.ArrayLike) -> tuple[Integers, Integers]:
-    """Return the first pixel and the number of pixels, across and down, [f, 2] of the boxes around faces."""
-    one, two, three = (screen[faces[:, corner], :2] for corner in range(3))
-    low = np.clip(np.ceil(np.minimum(np.minimum(one, two), three) - 0.5), 0, limit).astype(np.int64)
-    high = np.clip(np.floor(np.maximum(np.maximum(one, two), three) + 0.5), 0, limit).astype(np.int64)
-    return low, np.maximum(high - low, 0)
-
-
-def _rasterise(screen: Floats, faces: Integers, width: int, height: int) -> tuple[Integers, Floats]:
-    """Return the nearest face of every pixel centre [h * w] (-1: none) and its nearness (-inf: none).
-
-    ``screen`` [v, 3] holds pixels across, pixels down, and a nearness that is affine on the screen (larger is nearer).
-    """
-    planes, area = _planes(screen, faces)
-    low, span = _boxes(screen, faces, (width, height))
-    count = np.where(np.abs(area) > 1e-12, span[:, 0] * span[:, 1], 0)
-    farthest, depth = screen[:, 2].min(), max(float(np.ptp(screen[:, 2])), 1e-30)
-    best = np.full(width * height, _EMPTY)
-    drawn = np.flatnonzero(count)
-    for group in np.split(drawn, np.flatnonzero(np.diff(np.cumsum(count[drawn]) // _CANDIDATES_AT_ONCE)) + 1):
-        owner = np.repeat(group, count[group])
-        row, column = np.divmod(_ranges(count[group]), span[owner, 0])
-        row, column = row + low[owner, 1], column + low[owner, 0]
-        x, y = column + 0.5, row + 0.5
-        one, two = _on_plane(planes[0], owner, x, y), _on_plane(planes[1], owner, x, y)
-        inside = np.flatnonzero((one >= -1e-9) & (two >= -1e-9) & (one + two <= 1 + 1e-9))
-        near = _on_plane(planes[2], owner[inside], x[inside], y[inside])
-        far = ((1 - np.clip((near - farthest) / depth, 0, 1)) * _LEVELS).astype(np.int64)
-        np.minimum.at(best, row[inside] * width + column[inside], far << 32 | owner[inside])
-    found = best != _EMPTY
-    nearness = np.where(found, (1 - (best >> 32) / _LEVELS) * depth + farthest, -np.inf)
-    return np.where(found, best & 0xFFFFFFFF, -1), nearness
-
-
-def _ranges(counts: Integers) -> Integers:
-    """Return 0 .. count - 1 for every count, one after another."""
-    ends = np.cumsum(counts)
-    return np.asarray(np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts))

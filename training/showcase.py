@@ -7,9 +7,10 @@ from torch import nn
 
 from datagen.mesh import Mesh, bounding_box, save_mesh
 from datagen.store import Dataset
+from training.curves import training_curve
 from training.data import VertexBank
 from training.evaluation import POSE_TYPES, Row, evaluation_list
-from training.figures import TransferExample, training_curve, transfer_figure
+from training.figures import TransferExample, transfer_figure
 from training.inference import predict
 from training.journal import read_journal
 from training.recipe import EvaluationRecipe

@@ -5,19 +5,12 @@ order of triples is a function of (seed, step), so the state of a run is its wei
 """
 
 import contextlib
-import datetime
-import os
-import signal
-import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
-from filelock import FileLock, Timeout
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -29,27 +22,17 @@ from training.inference import network_from, predict
 from training.journal import Journal
 from training.losses import pose_transfer_loss
 from training.metrics import point_mesh_distance
+from training.ranks import (
+    Ranks,
+    TrainingError,
+    alone_in,
+    any_rank,
+    device_of,
+    mean_over_ranks,
+    process_group,
+    stop_on_sigterm,
+)
 from training.recipe import TrainingRecipe
-
-_LOCK_SECONDS = 30.0  # how long to wait for the ranks of a killed driver to be gone
-
-
-class TrainingError(DsffnetError):
-    """Training cannot go on: non-finite loss, too few CPUs, another process on the same run."""
-
-
-@dataclass(frozen=True)
-class Ranks:
-    """Where this process stands among those that train together."""
-
-    rank: int
-    count: int
-    local: int
-
-    @classmethod
-    def from_environment(cls) -> "Ranks":
-        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
-        return cls(*(int(os.environ.get(name, default)) for name, default in zip(names, "010", strict=True)))
 
 
 def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
@@ -75,7 +58,7 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
         See their messages; the last good checkpoint is kept.
     """
     ranks = Ranks.from_environment()
-    with _process_group(ranks, recipe), _alone(run, ranks):
+    with process_group(ranks, recipe), alone_in(run, ranks):
         return _Trainer(recipe, open_dataset(data), run, ranks).run()
 
 
@@ -84,7 +67,7 @@ class _Trainer:
         if recipe.batch % ranks.count:
             raise TrainingError(f"batch {recipe.batch} cannot be shared equally by {ranks.count} ranks")
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
-        self.device = _device(recipe, ranks)
+        self.device = device_of(recipe, ranks)
         self.bank = VertexBank(dataset, dataset.identities("training"), device=self.device)
         self.order = TripleOrder(
             dataset.identities("training"), dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed
@@ -99,7 +82,7 @@ class _Trainer:
         self.done = self._resume()
         self.model = DistributedDataParallel(self.network) if ranks.count > 1 else self.network
         self.is_writer = ranks.rank == 0
-        self.stopping, self._stop = False, _stop_on_sigterm()
+        self.stopping, self._stop = False, stop_on_sigterm()
 
     def run(self) -> int:
         journal = Journal(self.folder / "metrics.jsonl") if self.is_writer else None
@@ -111,7 +94,7 @@ class _Trainer:
             self.done += 1
             last = self.done == self.last_step
             if self.done % self.recipe.log_every == 0 or last:
-                shared = _mean_over_ranks(values, self.ranks)
+                shared = mean_over_ranks(values, self.ranks)
                 if journal and probe:
                     if self.done % self.recipe.evaluate_every == 0 or last:
                         shared |= probe.measure(self.network)
@@ -146,7 +129,7 @@ class _Trainer:
         """
         culprit = not bool(torch.isfinite(loss))
         bad = culprit or not bool(torch.isfinite(norm))
-        any_bad, self.stopping = _any_rank([bad, self._stop.is_set()], self.ranks)
+        any_bad, self.stopping = any_rank([bad, self._stop.is_set()], self.ranks)
         if any_bad:
             elsewhere = "on another rank" if self.ranks.count > 1 else "in the gradient only"
             where = f"this rank's triples were {triples.tolist()}" if culprit else elsewhere
@@ -173,7 +156,7 @@ class _Trainer:
                 )
             except DsffnetError as error:
                 failure = error
-        if _any_rank([failure is not None], self.ranks)[0]:
+        if any_rank([failure is not None], self.ranks)[0]:
             raise failure or TrainingError("rank 0 could not write a checkpoint")
 
     def _resume(self) -> int:
@@ -250,68 +233,3 @@ def _schedule(
     return torch.optim.lr_scheduler.StepLR(
         optimiser, step_size=schedule.decay_epochs * steps_per_epoch, gamma=schedule.decay
     )
-
-
-def _device(recipe: TrainingRecipe, ranks: Ranks) -> torch.device:
-    if recipe.device == "cpu" or (recipe.device == "auto" and not torch.cuda.is_available()):
-        return torch.device("cpu")
-    if not torch.cuda.is_available():
-        raise TrainingError("training.device is 'cuda', but torch sees no CUDA device. Use --set training.device=cpu")
-    torch.cuda.set_device(ranks.local)
-    return torch.device("cuda", ranks.local)
-
-
-def _any_rank(flags: list[bool], ranks: Ranks) -> list[bool]:
-    """For each flag, whether it is raised on any rank; every rank gets the same answer."""
-    if ranks.count == 1:
-        return flags
-    device = torch.device("cuda", ranks.local) if dist.get_backend() == "nccl" else "cpu"
-    shared = torch.tensor(flags, dtype=torch.float32, device=device)
-    dist.all_reduce(shared, op=dist.ReduceOp.MAX)
-    return [bool(flag) for flag in shared.tolist()]
-
-
-def _mean_over_ranks(values: dict[str, Tensor | float], ranks: Ranks) -> dict[str, float]:
-    """Means over the ranks, whose shares of a batch are equal; the means over the batch, that is."""
-    shared = torch.tensor([float(value) for value in values.values()], dtype=torch.float64)
-    if ranks.count > 1:
-        if dist.get_backend() == "nccl":
-            shared = shared.to(torch.device("cuda", ranks.local))
-        dist.all_reduce(shared)
-        shared /= ranks.count
-    return dict(zip(values, shared.tolist(), strict=True))
-
-
-@contextlib.contextmanager
-def _process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
-    """Join the process group, unless a launcher (Ray Train) has done so; leave it only after a clean end."""
-    if ranks.count == 1 or dist.is_initialized():
-        yield
-        return
-    backend = "nccl" if torch.cuda.is_available() and recipe.device != "cpu" else "gloo"
-    dist.init_process_group(backend, timeout=datetime.timedelta(seconds=recipe.timeout))
-    yield
-    dist.barrier()
-    dist.destroy_process_group()
-
-
-@contextlib.contextmanager
-def _alone(run: Path, ranks: Ranks) -> Iterator[None]:
-    """One training a run: rank 0 holds a lock that the operating system drops if the process dies."""
-    if ranks.rank != 0:
-        yield
-        return
-    run.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(run / ".lock").acquire(timeout=_LOCK_SECONDS):
-            yield
-    except Timeout as error:
-        raise TrainingError(f"another process is training in {run}. Wait for it, or stop it, then run again") from error
-
-
-def _stop_on_sigterm() -> threading.Event:
-    """An event that SIGTERM sets, where this thread may install a handler (Ray Train's workers may not)."""
-    stop = threading.Event()
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    return stop

@@ -29,7 +29,8 @@ from training.figures import (
     placed,
     vertex_errors,
 )
-from training.rendering import Floats, Integers, frame, ground_shadow, openness
+from training.rasteriser import Floats, Integers
+from training.rendering import frame, ground_shadow, openness
 
 _LEVELS = 65535
 _GROUND_EVERY = 2  # the page keeps every second cell of the ground's shadow

@@ -8,7 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from training import figures
+from training import curves
+from training.curves import training_curve
 from training.figures import (
     ERROR_COLORS,
     ErrorScale,
@@ -16,11 +17,10 @@ from training.figures import (
     contact_sheet,
     error_colors,
     placed,
-    training_curve,
     transfer_figure,
     vertex_errors,
 )
-from training.rendering import Floats, Integers
+from training.rasteriser import Floats, Integers
 
 PANEL = (120, 140)
 
@@ -158,7 +158,7 @@ def drawn_axes(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
         made.append(figure)
         return Path(path)
 
-    monkeypatch.setattr(figures, "_saved", keep)
+    monkeypatch.setattr(curves, "saved", keep)
     return made
 
 
@@ -188,9 +188,9 @@ def test_training_curve_without_any_value_is_refused(tmp_path: Path) -> None:
 
 
 def test_smoothing_keeps_a_constant_and_the_middle_of_a_power_law() -> None:
-    assert figures._smooth(np.full(100, 0.3)) == pytest.approx(0.3)
+    assert curves._smooth(np.full(100, 0.3)) == pytest.approx(0.3)
     falling = np.exp(-np.arange(200) / 40)
-    assert figures._smooth(falling)[50] == pytest.approx(falling[50])
+    assert curves._smooth(falling)[50] == pytest.approx(falling[50])
 
 
 def test_contact_sheet_shows_every_cell_on_one_scale(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from datagen.generate import generate
 from tests.support.files import flip_bit
 from tests.support.ranks import finish, start_ranks
 from tests.support.recipes import tiny_dataset, tiny_training
-from training import checkpoint, trainer
+from training import checkpoint, ranks
 from training.checkpoint import CheckpointError, require_checkpoint
 from training.journal import read_journal
-from training.trainer import TrainingError, train
+from training.ranks import Ranks, TrainingError, alone_in
+from training.trainer import train
 
 
 def losses(run: Path) -> torch.Tensor:
@@ -94,8 +95,8 @@ def test_nan_on_one_rank_stops_both_before_the_step(dataset: str, tmp_path: Path
     monkeypatch.setenv("FAULT_RANK", "1")
     monkeypatch.setenv("FAULT_STEP", "7")
     recipe = tiny_training(launcher="ray", ranks=2)
-    ranks = start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2, module="tests.support.faulty_rank")
-    (first, said), (second, said_by_culprit) = finish(ranks)
+    started = start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2, module="tests.support.faulty_rank")
+    (first, said), (second, said_by_culprit) = finish(started)
     assert first and second
     assert "not finite at step 7 (on another rank)" in said
     assert "not finite at step 7 (this rank's triples were [[" in said_by_culprit
@@ -108,11 +109,11 @@ def test_sigkill_of_a_rank_ends_the_other_and_a_restart_ends_equal(dataset: str,
     recipe = tiny_training(launcher="ray", ranks=2, steps=400, log_every=1, checkpoint_every=20)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     finish(start_ranks(recipe, data=dataset, run=whole, count=2))
-    ranks = start_ranks(recipe, data=dataset, run=killed, count=2)
+    started = start_ranks(recipe, data=dataset, run=killed, count=2)
     while not list((killed / "checkpoints").glob("step-*")):
         time.sleep(0.01)
-    ranks[1].send_signal(signal.SIGKILL)
-    statuses = [status for status, _ in finish(ranks, timeout=60)]
+    started[1].send_signal(signal.SIGKILL)
+    statuses = [status for status, _ in finish(started, timeout=60)]
     assert statuses[1] == -signal.SIGKILL and statuses[0] != 0
     assert [status for status, _ in finish(start_ranks(recipe, data=dataset, run=killed, count=2))] == [0, 0]
     assert same_bits(killed, whole)
@@ -120,12 +121,12 @@ def test_sigkill_of_a_rank_ends_the_other_and_a_restart_ends_equal(dataset: str,
 
 def test_sigterm_finishes_the_step_and_checkpoints(dataset: str, tmp_path: Path) -> None:
     run, recipe = tmp_path / "run", tiny_training(steps=100_000, checkpoint_every=100_000)
-    (rank,) = ranks = start_ranks(recipe, data=dataset, run=run, count=1)
+    (rank,) = started = start_ranks(recipe, data=dataset, run=run, count=1)
     while not read_journal(run / "metrics.jsonl"):
         time.sleep(0.05)
     began = time.monotonic()
     rank.send_signal(signal.SIGTERM)
-    ((status, output),) = finish(ranks, timeout=30)
+    ((status, output),) = finish(started, timeout=30)
     assert status == 0, output
     assert time.monotonic() - began < 15
     assert require_checkpoint(run).step == read_journal(run / "metrics.jsonl")[-1]["step"]
@@ -162,9 +163,11 @@ def test_a_damaged_dataset_is_refused(spoilable: Path, tmp_path: Path) -> None:
 
 
 def test_two_trainings_in_one_run(dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "_LOCK_SECONDS", 0)
-    ranks = trainer.Ranks(0, 1, 0)
-    with trainer._alone(tmp_path / "run", ranks), pytest.raises(TrainingError, match="another process is training in"):
+    monkeypatch.setattr(ranks, "LOCK_SECONDS", 0)
+    with (
+        alone_in(tmp_path / "run", Ranks(0, 1, 0)),
+        pytest.raises(TrainingError, match="another process is training in"),
+    ):
         train(tiny_training(), data=dataset, run=tmp_path / "run")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from training.figures import ErrorScale, TransferExample, placed
-from training.rendering import Floats, Integers
+from training.rasteriser import Floats, Integers
 from training.viewer import decode_positions, viewer_payload, write_viewer
 
 HOSTILE = "</script><img src=x onerror=alert(1)><!-- <script> ${title} &amp; \u2028 '\""

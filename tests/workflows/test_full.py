@@ -128,7 +128,9 @@ def test_mlflow_shows_one_parent_three_children_and_a_loadable_model(undisturbed
     model = mlflow.pyfunc.load_model("models:/dsffnet@latest-trained")
     dataset = open_dataset(str(undisturbed / "dataset.zarr"))
     meshes = {"source": dataset.vertices(4, 0), "target": dataset.vertices(5, 1), "target_faces": dataset.faces(5)}
-    posed = model.predict({name: values.astype("int64" if "faces" in name else float) for name, values in meshes.items()})
+    posed = model.predict(
+        {name: values.astype("int64" if "faces" in name else float) for name, values in meshes.items()}
+    )
     assert posed.shape == meshes["target"].shape
 
 
@@ -136,9 +138,9 @@ def test_sigkill_of_the_driver_in_every_stage(undisturbed: Path, tmp_path: Path)
     out = tmp_path / "out"
     moments = [
         lambda: shards(out) >= 5,
-        lambda: (out / "stages" / "generate.json").exists(),
+        (out / "stages" / "generate.json").exists,
         lambda: trained_steps(out) >= 60,
-        lambda: (out / "run" / "evaluation" / "record.json").exists(),
+        (out / "run" / "evaluation" / "record.json").exists,
     ]
     for moment in moments:
         process = start(out, *longer(out))
@@ -180,7 +182,15 @@ def test_tracking_server_down_costs_nothing_but_the_exit_status(tmp_path: Path) 
     status, output = run(out, "--tracking-uri", "http://127.0.0.1:9")
     assert status == 1 and output.count("error: MLflow at http://127.0.0.1:9 does not answer") == 1, output
     assert "Nothing is lost" in output and (out / "run" / "evaluation" / "tables.md").exists()
-    sync = [sys.executable, "-m", "workflows.cli", "sync", str(out), "--tracking-uri", f"sqlite:///{tmp_path / 'later.db'}"]
+    sync = [
+        sys.executable,
+        "-m",
+        "workflows.cli",
+        "sync",
+        str(out),
+        "--tracking-uri",
+        f"sqlite:///{tmp_path / 'later.db'}",
+    ]
     done = subprocess.run(sync, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0 and "is up to date" in done.stdout, done.stderr
     assert len(json.loads((out / "mlflow.json").read_text())) == 1

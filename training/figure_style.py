@@ -1,0 +1,23 @@
+"""What all figures share: ink, paper, resolution, and how they are written."""
+
+import os
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+DPI = 200
+INK, QUIET, RULE = "#1d2430", "#6b7483", "#e3e6ea"
+PAGE = (1.0, 1.0, 1.0)
+
+
+def saved(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write under a temporary name and rename, so that a reader never meets half a picture."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        figure.savefig(temporary, format="png", dpi=DPI)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
