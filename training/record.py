@@ -4,8 +4,10 @@ FOLDER/record.json: name, kind, parent, parameters, dataset, status, times, arti
 :mod:`training.tracking` mirrors such folders to MLflow and can be repeated at any time.
 """
 
+import getpass
 import json
 import os
+import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -68,6 +70,7 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         kind=kind,
         parent=os.path.relpath(parent, folder) if parent else None,
         parameters=parameters,
+        tags={"mlflow.user": _user(), "mlflow.source.name": sys.argv[0], "mlflow.source.type": "LOCAL"},
         started=before.started if before else _now(),
     )
     write_record(folder, record)
@@ -115,6 +118,13 @@ def _has_parent(folder: Path) -> bool:
 def _start_of(folder: Path) -> int:
     record = read_record(folder)
     return record.started if record else 0
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError, ImportError):  # a container's user without a name
+        return "unknown"
 
 
 def _now() -> int:

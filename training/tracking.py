@@ -47,7 +47,6 @@ def publish(root: Path, server: Server) -> None:
         The server cannot be reached or refuses; repeat later.
     """
     import mlflow
-    from mlflow.exceptions import MlflowException
 
     for chatty in ("mlflow", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
@@ -58,8 +57,9 @@ def publish(root: Path, server: Server) -> None:
             record = read_record(folder)
             if record is not None:
                 _Publication(client, server, folder, record).run()
-    except (MlflowException, OSError) as error:
-        reason = str(error).splitlines()[0][:200]
+    except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
+        log.debug("publishing %s failed", root, exc_info=True)
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise TrackingError(
             f"MLflow at {server.uri} does not answer as it should ({reason}). Nothing is lost: "
             f"dsffnet sync {root} --tracking-uri {server.uri} sends what is missing"
@@ -78,6 +78,8 @@ class _Publication:
             self.sent = {"run": self._create_run(), "offsets": {}, "artifacts": {}}
             self._note()
         self._once("parameters", self._send_parameters)
+        if self.record.tags != self.sent.get("tags", {}):
+            self._send_tags()
         if self.record.dataset:
             self._once("dataset", self._send_dataset)
         self._send_metrics()
@@ -100,7 +102,7 @@ class _Publication:
             raise
 
     def _create_run(self) -> str:
-        tags = {"kind": self.record.kind, **self.record.tags}
+        tags = {"kind": self.record.kind}
         if self.record.parent:
             parent = (self.folder / self.record.parent).resolve()
             tags[_PARENT_TAG] = _read_sent(parent)[self.server.uri]["run"]
@@ -115,6 +117,13 @@ class _Publication:
         items = [Param(key, value[:_LONGEST_PARAMETER]) for key, value in self.record.parameters.items()]
         for start in range(0, len(items), _PARAMETERS_AT_ONCE):
             self.client.log_batch(self.sent["run"], params=items[start : start + _PARAMETERS_AT_ONCE])
+
+    def _send_tags(self) -> None:
+        from mlflow.entities import RunTag
+
+        tags = [RunTag(key, value[:_LONGEST_PARAMETER]) for key, value in self.record.tags.items()]
+        self.client.log_batch(self.sent["run"], tags=tags)
+        self._note(tags=self.record.tags)
 
     def _send_dataset(self) -> None:
         from mlflow.data.code_dataset_source import CodeDatasetSource

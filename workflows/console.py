@@ -6,14 +6,21 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from datagen.errors import DsffnetError, RecipeError
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
 from workflows.recipe import describe_fields, known_recipes
 
 _OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr")
+
+
+class WorkflowError(DsffnetError):
+    """A workflow that cannot run as asked."""
 
 
 def guarded(main: Callable[[], None]) -> None:
@@ -110,6 +117,23 @@ def remove_run(run: Path) -> None:
     shutil.rmtree(run, ignore_errors=True)
 
 
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Hold a workflow's folder; the operating system gives it back if this process dies.
+
+    Raises
+    ------
+    WorkflowError
+        Another process has it.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(out / ".lock").acquire(timeout=0):
+            yield
+    except Timeout as error:
+        raise WorkflowError(f"another workflow is running in {out}. Wait for it, or stop it, then run again") from error
+
+
 def start_over(out: Path) -> None:
     """Remove what a workflow keeps in ``out``, and nothing else; the MLflow store stays.
 
@@ -136,6 +160,14 @@ def start_over(out: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def _programs() -> str:
+    """Folder of this environment's programs with a slash behind it, or nothing where the shell finds them anyway."""
+    here = Path(sys.executable).parent
+    if shutil.which("dsffnet") == str(here / "dsffnet"):
+        return ""
+    return f"{os.path.relpath(here) if here.is_relative_to(Path.cwd()) else here}/"
+
+
 def closing_words(out: Path, server: Server) -> str:
     """The table, where everything lies, and what to try next."""
     evaluation = out / "run" / "evaluation"
@@ -144,6 +176,8 @@ def closing_words(out: Path, server: Server) -> str:
     run = shown / "run"
     here = shown / "run" / "evaluation"
     meshes = here / "meshes"
+    programs = _programs()
+    dsffnet = f"{programs}dsffnet"
     ui = (
         f"make ui OUT={shown}"
         if server.uri.startswith("sqlite")
@@ -162,6 +196,6 @@ Where everything lies
 
 Try next
   {ui}
-  dsffnet transfer --model {run} --source {meshes}/00-source.glb --target {meshes}/01-target.glb --out posed.glb
-  python workflows/full.py --out runs/custom --set data.identities.seed=7 data.identities.training=24
+  {dsffnet} transfer --model {run} --source {meshes}/00-source.glb --target {meshes}/01-target.glb --out posed.glb
+  {programs}python workflows/full.py --out runs/custom --set data.identities.seed=7 data.identities.training=24
 """

@@ -8,6 +8,7 @@
 Run the same command again to go on from where it was; finished stages are skipped.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -21,10 +22,10 @@ from functools import partial
 
 from datagen.errors import DsffnetError
 from datagen.store import open_dataset
-from training.record import update_record
+from training.record import read_record, update_record
 from training.tracking import Mirror
 from workflows.cluster import ray_cluster, require_reachable
-from workflows.console import closing_words, guarded, server_of, start_over, workflow_parser
+from workflows.console import alone_in, closing_words, guarded, server_of, start_over, workflow_parser
 from workflows.pipeline import evaluate_stage, generate_stage, is_evaluated, is_trained, recorded, train_stage
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
 from workflows.stages import Stage, run_stage
@@ -40,11 +41,12 @@ def main(arguments: list[str] | None = None) -> None:
     if options.fresh:
         start_over(out)
     mirror = Mirror(out, server)
-    mirror.start()
-    try:
-        run_workflow(recipe, out)
-    finally:
-        outage = mirror.close()
+    with alone_in(out):
+        mirror.start()
+        try:
+            run_workflow(recipe, out)
+        finally:
+            outage = mirror.close()
     print(closing_words(out, server))
     if outage:
         raise outage
@@ -72,7 +74,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
             "evaluate",
             depends_on=[sections["data"], sections["training"], sections["evaluation"]],
             intact=lambda: is_evaluated(run),
-            work=partial(evaluate_stage, recipe.evaluation, data, run, parent=out),
+            work=partial(_evaluate, recipe, data, run, out),
         )
         for stage in (generate, train, evaluate):
             run_stage(stage, out=out, before=begin)
@@ -85,6 +87,21 @@ def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path) -> None:
     around.enter_context(recorded(out, kind="workflow", name=out.name, parent=None, parameters=parameters))
     update_record(out, artifacts=["recipe.yaml"])
     around.enter_context(ray_cluster())
+
+
+def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path) -> None:
+    """Evaluate, and give the parent record what a person wants to see first: table, pictures, main metrics."""
+    evaluate_stage(recipe.evaluation, data, run, parent=out)
+    evaluation = run / "evaluation"
+    parent, child = read_record(out), read_record(evaluation)
+    assert parent is not None and child is not None
+    shown = [os.path.relpath(evaluation / name, out) for name in ("tables.md", "viewer.html", "figures")]
+    update_record(
+        out,
+        artifacts=["recipe.yaml", *shown],
+        metrics=child.metrics,
+        tags=parent.tags | {"mlflow.note.content": (evaluation / "tables.md").read_text()},
+    )
 
 
 def _once(work: Callable[[], None]) -> Callable[[], None]:

@@ -10,9 +10,11 @@ import pytest
 
 from datagen.mesh import Mesh, load_mesh, save_mesh
 from datagen.store import open_dataset
-from tests.support.files import flip_bit
+from tests.support.disk import grow, small_disk
+from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
 from training.trainer import train
+from workflows.console import alone_in
 
 ROOT = Path(__file__).parents[2]
 
@@ -120,6 +122,19 @@ def test_bad_recipes_and_usage_exit_2(tmp_path: Path) -> None:
     assert command("generate").returncode == 2 and not out.exists() and not (tmp_path / "w").exists()
 
 
+def test_a_full_disk_is_one_error_and_going_on_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    arguments = ("generate", "--recipe", "smoke", "--local", "--set", "data.poses.seen=100")
+    undisturbed = tmp_path / "undisturbed.zarr"
+    assert command(*arguments, "--out", undisturbed).returncode == 0
+    with small_disk(tmp_path / "disk", kibibytes=600) as disk:
+        data = disk / "leg.zarr"
+        fails(command(*arguments, "--out", data), 1, "No space left on device", "What was complete is untouched")
+        assert "building" in command("inspect", data).stdout
+        grow(disk, kibibytes=16_000)
+        assert command(*arguments, "--out", data).returncode == 0
+        assert tree_hash(data) == tree_hash(undisturbed)
+
+
 def test_missing_and_unfinished_datasets(tmp_path: Path, trained: tuple[Path, Path]) -> None:
     fails(command("inspect", tmp_path / "no.zarr"), 1, "no dataset at", "dsffnet generate")
     fails(command("train", "--data", tmp_path / "no.zarr", "--out", tmp_path / "run"), 1, "no dataset at")
@@ -130,6 +145,11 @@ def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
     result = command("--recipe", "smoke", "--out", "runs/x", script="full.py", RAY_ADDRESS="127.0.0.1:1")
     fails(result, 2, "--out 'runs/x' is a relative path", "throw-away copy", "--out /data/runs/x")
     fails(command("--recipe", "smoke", script="full.py", RAY_ADDRESS="127.0.0.1:1"), 2, "relative path")
+
+
+def test_two_workflows_in_one_folder(tmp_path: Path) -> None:
+    with alone_in(tmp_path / "w"):
+        fails(command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another workflow is running")
 
 
 def test_fresh_leaves_other_peoples_files_alone(tmp_path: Path) -> None:

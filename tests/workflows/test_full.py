@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from datagen.store import open_dataset
+from tests.support.disk import grow, small_disk
 from tests.support.files import tree_hash
 from training.checkpoint import require_checkpoint
 from training.journal import read_journal
@@ -194,6 +195,15 @@ def test_tracking_server_down_costs_nothing_but_the_exit_status(tmp_path: Path) 
     done = subprocess.run(sync, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0 and "is up to date" in done.stdout, done.stderr
     assert len(json.loads((out / "mlflow.json").read_text())) == 1
+
+
+def test_a_full_disk_ends_it_with_one_error_and_it_goes_on_once_there_is_room(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", kibibytes=3_000) as disk:
+        status, output = run(disk / "out", *longer(disk / "out"))
+        assert status == 1 and output.count("error: ") == 1 and "Traceback" not in output, output
+        grow(disk, kibibytes=400_000)
+        status, output = run(disk / "out", *longer(disk / "out"))
+        assert status == 0, output
 
 
 def test_more_ranks_than_cpus(tmp_path: Path) -> None:
