@@ -4,6 +4,7 @@
 >>> model.predict({"source": source_vertices, "target": vertices, "target_faces": faces})     # doctest: +SKIP
 """
 
+import warnings
 from typing import Any
 
 import mlflow
@@ -12,6 +13,9 @@ from mlflow.pyfunc import PythonModel
 
 from datagen.mesh import Mesh
 from training.transfer import PoseTransfer
+
+# The model has a signature; MLflow's advice to type it otherwise does not fit a dictionary of arrays.
+warnings.filterwarnings("ignore", message=".*Add type hints to the `predict` method")
 
 
 class PoseTransferModel(PythonModel):  # type: ignore[misc]

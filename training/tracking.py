@@ -196,10 +196,21 @@ class _Publication:
                 code_paths=code,
                 signature=_signature(),
                 pip_requirements=["torch", "safetensors", "numpy", "scipy", "pydantic", "filelock", "zarr", "trimesh"],
-                registered_model_name=self.record.model,
-                await_registration_for=60,
             )
-        self.client.set_registered_model_alias(self.record.model, ALIAS, model.registered_model_version)
+        name, version = self.record.model, self._register_version(model.model_uri)
+        self.client.set_registered_model_alias(name, ALIAS, version)
+
+    def _register_version(self, source: str) -> str:
+        """As log_model's own registration, which prints into the progress bars."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            self.client.create_registered_model(self.record.model)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+        version = self.client.create_model_version(self.record.model, source, self.sent["run"])
+        return str(version.version)
 
     def _send_status(self) -> None:
         if self.record.status == "RUNNING":

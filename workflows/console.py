@@ -144,9 +144,8 @@ def start_over(out: Path) -> None:
     """
     from datagen.generate import remove
 
-    if not out.exists():
-        return
-    if any(out.iterdir()) and not (out / "recipe.yaml").exists():
+    strangers = {path.name for path in out.iterdir()} - {".lock", "mlflow.db", "mlartifacts", *_OWN}
+    if strangers and not (out / "recipe.yaml").exists():
         raise RecipeError(
             f"{out} holds files but no workflow of ours, so --fresh leaves it alone. Choose another --out"
         )

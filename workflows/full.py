@@ -38,10 +38,10 @@ def main(arguments: list[str] | None = None) -> None:
     name = Path(options.recipe).stem
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
     server = server_of(out, options.tracking_uri)
-    if options.fresh:
-        start_over(out)
     mirror = Mirror(out, server)
     with alone_in(out):
+        if options.fresh:
+            start_over(out)
         mirror.start()
         try:
             run_workflow(recipe, out)
