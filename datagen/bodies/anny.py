@@ -122,7 +122,8 @@ def _load_anny(topology: str) -> Any:
     Anny writes that cache in place. A lock keeps two workers from building at once, and a mark left by a build
     that was killed makes the next one start from nothing.
     """
-    with contextlib.redirect_stdout(io.StringIO()):  # warp greets on import
+    _silence_warp()
+    with contextlib.redirect_stdout(io.StringIO()):
         import anny
         from anny.paths import get_anny_cache_path
 
@@ -142,6 +143,14 @@ def _load_anny(topology: str) -> Any:
                 ) from error
             mark.unlink()
     return model
+
+
+def _silence_warp() -> None:
+    """Warp, which Anny uses to make its coarser topologies, greets with its devices; where it is missing, so be it."""
+    with contextlib.suppress(ImportError):
+        import warp
+
+        warp.config.quiet = True
 
 
 def _forget_since(cache: Path, mark: Path) -> None:
