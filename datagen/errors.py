@@ -29,5 +29,9 @@ class DatasetError(DsffnetError):
     """A dataset that is missing, incomplete, damaged, of another version, or made by another recipe."""
 
 
+class ClusterError(DsffnetError):
+    """The Ray cluster cannot be reached, has no room, or gave up on a task."""
+
+
 class StorageError(DsffnetError):
     """Files could not be written (full disk, no permission); what was there before is untouched."""

@@ -16,12 +16,12 @@ from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from datagen.bodies import load_body
-from datagen.errors import BodyError, DatasetError
+from datagen.errors import BodyError, ClusterError, DatasetError
 from datagen.grid import Grid, Shard
 from datagen.poses import draw_poses
 from datagen.recipe import DatasetRecipe
-from datagen.store.reader import Dataset, open_dataset
-from datagen.store.schema import ManifestRow
+from datagen.store.reader import Dataset, open_dataset, read_manifest
+from datagen.store.schema import ManifestRow, open_group
 from datagen.store.verify import Fault, find_faults
 from datagen.store.writer import begin, existing_shard, finish, identity_parameters, write_shard
 
@@ -86,6 +86,11 @@ def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
             yield ray.get(done.pop())
     except ray.exceptions.RayTaskError as error:
         raise error.cause from error
+    except ray.exceptions.RayError as error:
+        raise ClusterError(
+            f"Ray gave up on a task ({type(error).__name__}: {str(error).splitlines()[0]}). "
+            "Run the same command again to go on from here"
+        ) from error
     finally:
         for reference in running:
             ray.cancel(reference)
@@ -121,6 +126,8 @@ def generate(
     """
     if not fresh and _complete(url, recipe):
         return open_dataset(url)
+    if is_local(url):
+        require_ours(url)
     with writing_alone(url):
         if fresh:
             remove(url)
@@ -151,7 +158,14 @@ def repair(
 ) -> Dataset:
     """Make the faulty shards again and check that the dataset is whole; the others are not touched."""
     with writing_alone(url):
-        list(run(_remake, [(url, recipe, fault.shard) for fault in faults if fault.shard]))
+        list(run(prepare, [(url, recipe, None)]))
+        before = {row.path: row.sha256 for row in read_manifest(open_group(url))}
+        for row in run(_remake, [(url, recipe, fault.shard) for fault in faults if fault.shard]):
+            if before.get(row.path, row.sha256) != row.sha256:
+                raise DatasetError(
+                    f"{url}: shard {row.path} was made again, but not the same: other package versions made it "
+                    f"(dsffnet inspect {url} names them). Install those, or make the dataset anew with --fresh"
+                )
         _make_missing(recipe, url, run, progress)
     left = list(find_faults(url))
     if left:
@@ -178,12 +192,29 @@ def remove(url: str) -> None:
     """
     if not is_local(url):
         raise DatasetError(f"--fresh removes local datasets only; remove {url} with your storage's own tools")
+    require_ours(url)
+    shutil.rmtree(url, ignore_errors=not Path(url).exists())
+
+
+def require_ours(url: str) -> None:
+    """Refuse a local place that holds anything but a dataset of ours.
+
+    Raises
+    ------
+    DatasetError
+        It is a file, or a folder with other things in it.
+    """
     path = Path(url)
-    if not path.exists():
-        return
-    if not (path / "zarr.json").exists() and any(path.iterdir()):
-        raise DatasetError(f"{url} is not a dataset, so it is not removed. Choose another --out")
-    shutil.rmtree(path)
+    if path.is_file():
+        raise DatasetError(f"{url} is a file, not a dataset. Choose another --out")
+    strangers = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")} if path.exists() else set()
+    if strangers - _MEMBERS:
+        raise DatasetError(
+            f"{url} holds what is not a dataset ({sorted(strangers - _MEMBERS)[0]}). Choose another --out"
+        )
+
+
+_MEMBERS = {"zarr.json", "topology", "identity", "pose", "evaluation", "manifest"}
 
 
 @contextlib.contextmanager

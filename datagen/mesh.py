@@ -72,8 +72,10 @@ def load_mesh(path: str | Path) -> Mesh:
 def _single_geometry(path: Path) -> Mesh:
     import trimesh
 
+    is_obj = path.suffix.lower() == ".obj"  # materials and groups must not split its one list of vertices
     try:
-        scene = trimesh.load_scene(path, process=False, maintain_order=True)
+        options = {"group_material": False, "split_object": False, "skip_materials": True} if is_obj else {}
+        scene = trimesh.load_scene(path, process=False, maintain_order=True, **options)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     except Exception as error:  # trimesh's readers raise whatever their parsers raise
         raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error

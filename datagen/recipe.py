@@ -19,7 +19,7 @@ AnnyTopology = Literal[
 class Frozen(BaseModel):
     """Base of every recipe section: immutable, unknown keys are errors, defaults are validated too."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 
 
 class PhenotypeRanges(Frozen):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -64,19 +65,21 @@ def save_checkpoint(
     """
     folder = run / "checkpoints"
     final = folder / f"step-{about['step']:08d}"
+    if final.exists() and _fault(final) is None:
+        return final  # training is deterministic: this step's checkpoint is there
     try:
         folder.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(dir=folder, prefix=".partial-"))
         try:
             _write(temporary, about, weights, state)
-            if final.exists():
-                shutil.rmtree(final)
+            shutil.rmtree(final, ignore_errors=True)  # a damaged one
             os.replace(temporary, final)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
-    except OSError as error:
-        raise StorageError(f"could not write checkpoint {final}: {error.strerror or error}") from error
+    except (OSError, SafetensorError, RuntimeError) as error:  # a full disk: safetensors and torch say it their own way
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise StorageError(f"could not write checkpoint {final}: {reason}. Earlier checkpoints are kept") from error
     write_atomically(run / "latest", f"{final.name}\n".encode())
     _forget_old(folder, keep)
     return final
@@ -91,7 +94,7 @@ def load_checkpoint(run: Path) -> Checkpoint | None:
     for path in (*here, *_newest_first(run / "checkpoints")):
         fault = _fault(path)
         if fault is None:
-            return _read(path)
+            return read_checkpoint(path)
         log.warning("checkpoint %s is damaged (%s); falling back to the one before it", path, fault)
     return None
 
@@ -104,11 +107,9 @@ def require_checkpoint(run: Path) -> Checkpoint:
     CheckpointError
         There is none.
     """
-    found = load_checkpoint(run)
+    found = load_checkpoint(run) or load_checkpoint(run / "run")  # a workflow's folder holds its run under this name
     if found is None:
-        raise CheckpointError(
-            f"{run} has no usable checkpoint. Train first: dsffnet train --data DATA.zarr --out {run}"
-        )
+        raise CheckpointError(f"{run} has no usable checkpoint. Name the folder of a training that has written one")
     return found
 
 
@@ -131,7 +132,8 @@ def _write(folder: Path, about: dict[str, Any], weights: dict[str, Tensor], stat
             os.fsync(file.fileno())
 
 
-def _read(path: Path) -> Checkpoint:
+def read_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in a folder that is known to be sound."""
     manifest = json.loads((path / _MANIFEST).read_text())
     return Checkpoint(path, manifest["step"], manifest["recipe"], manifest["dataset"])
 
@@ -152,7 +154,8 @@ def _newest_first(folder: Path) -> Iterator[Path]:
 
 
 def _forget_old(folder: Path, keep: int) -> None:
-    for path in list(_newest_first(folder))[keep:]:
+    sound = [path for path in _newest_first(folder) if _fault(path) is None]
+    for path in set(_newest_first(folder)) - set(sound[:keep]):
         shutil.rmtree(path, ignore_errors=True)
     for path in folder.glob(".partial-*"):
         shutil.rmtree(path, ignore_errors=True)

@@ -1,7 +1,7 @@
 """Dataset -> decoded bank of normalised meshes -> batches of triples, a function of (seed, epoch, index).
 
 A training triple is (source, target, truth): truth = (target's identity, source's pose); source and target differ in
-identity and in pose (REFERENCE: DSFFNet, section 4.1). One epoch shows every cell of the training grid once as truth.
+identity and in pose (DSFFNet, section 4.1). One epoch shows every cell of the training grid once as truth.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,6 +25,31 @@ class Batch:
     source: Tensor
     target: Tensor
     truth: Tensor
+
+    def to(self, device: torch.device) -> "Batch":
+        """The same on another device."""
+        return Batch(self.source.to(device), self.target.to(device), self.truth.to(device))
+
+
+def read_batch(dataset: Dataset, triples: NDArray[np.integer]) -> Batch:
+    """The normalised meshes of rows (source identity, source pose, target identity, target pose), and only those.
+
+    Poses are row numbers of the identities, as they are for every identity of a generated grid. For a few triples of
+    a large dataset; :class:`VertexBank` is for many.
+    """
+    source_identity, source_pose, target_identity, target_pose = triples.T
+    return Batch(
+        source=_read(dataset, source_identity, source_pose),
+        target=_read(dataset, target_identity, target_pose),
+        truth=_read(dataset, target_identity, source_pose),
+    )
+
+
+def _read(dataset: Dataset, identities: NDArray[np.integer], poses: NDArray[np.integer]) -> Tensor:
+    meshes = [dataset.vertices(int(identity), int(pose)) for identity, pose in zip(identities, poses, strict=True)]
+    if len({len(mesh) for mesh in meshes}) > 1:
+        raise DatasetError(f"{dataset.url} mixes vertex counts, which one batch cannot hold")
+    return torch.from_numpy(np.stack([bounding_box(mesh).normalise(mesh) for mesh in meshes]).astype(np.float32))
 
 
 class VertexBank:

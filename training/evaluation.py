@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datagen.grid import PoseType
-from datagen.mesh import bounding_box, write_atomically
+from datagen.mesh import bounding_box, edges_of, write_atomically
 from datagen.store import Dataset, open_dataset
 from training import metrics
-from training.data import VertexBank
+from training.checkpoint import require_checkpoint
+from training.data import read_batch
 from training.inference import load_trained, predict
 from training.recipe import EvaluationRecipe
 
@@ -67,9 +69,9 @@ def evaluate(
 
     ``tasks`` runs functions over argument tuples here or on a cluster (see ``datagen.generate``).
     """
-    dataset = open_dataset(data)
+    dataset, checkpoint = open_dataset(data), require_checkpoint(run).path
     arguments = [
-        (str(run), data, recipe, method, pose_type, start)
+        (str(checkpoint), data, recipe, method, pose_type, start)
         for pose_type in POSE_TYPES
         for start in range(0, len(evaluation_list(dataset, recipe, pose_type)), recipe.chunk)
     ]
@@ -78,13 +80,13 @@ def evaluate(
 
 
 def measure_chunk(
-    run: str, data: str, recipe: EvaluationRecipe, method: str, pose_type: PoseType, start: int
+    checkpoint: str, data: str, recipe: EvaluationRecipe, method: str, pose_type: PoseType, start: int
 ) -> list[Row]:
-    """Rows of the triples [start, start + recipe.chunk) of one list, for the network and the no-op baselines."""
-    torch.set_num_threads(max(1, torch.get_num_threads()))
-    dataset, bank, network = _loaded(run, data)
+    """Rows of the triples [start, start + recipe.chunk) of one list, for one checkpoint and the no-op baselines."""
+    dataset, network = open_dataset(data), _network(checkpoint)
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    batch = bank.batch(triples)
+    batch = read_batch(dataset, triples)
+    faces = dataset.faces(int(triples[0, 2]))
     outputs = {method: predict(network, batch), NO_OPS[0]: batch.target}
     if batch.source.shape == batch.truth.shape:
         outputs[NO_OPS[1]] = batch.source
@@ -93,23 +95,23 @@ def measure_chunk(
         Row(name, pose_type, start + place, *map(int, triple), *values)
         for name, output in outputs.items()
         for place, (triple, values) in enumerate(
-            zip(triples, _measure(output, batch.truth, bank, half, recipe), strict=True)
+            zip(triples, _measure(output, batch.truth, faces, half, recipe), strict=True)
         )
     ]
 
 
 def _measure(
-    output: Tensor, truth: Tensor, bank: VertexBank, half: Tensor, recipe: EvaluationRecipe
+    output: Tensor, truth: Tensor, faces: NDArray[np.int32], half: Tensor, recipe: EvaluationRecipe
 ) -> list[tuple[float, ...]]:
-    faces = torch.from_numpy(bank.faces).long()
+    edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
     columns = (
         metrics.point_mesh_distance(output, truth),
         metrics.recentred_point_mesh_distance(output, truth),
         metrics.chamfer_distance(output, truth),
         metrics.earth_mover_distance(output, truth, points=recipe.emd_points, seed=recipe.seed),
         metrics.mean_euclidean_error(output, truth) * half * 1000,
-        metrics.edge_length_ratio_error(output, truth, bank.edges),
-        metrics.normal_angle_error(output, truth, faces),
+        metrics.edge_length_ratio_error(output, truth, edges),
+        metrics.normal_angle_error(output, truth, triangles),
     )
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
@@ -120,9 +122,8 @@ def _half_size(dataset: Dataset, identity: int, pose: int) -> float:
 
 
 @lru_cache(maxsize=1)
-def _loaded(run: str, data: str) -> tuple[Dataset, VertexBank, nn.Module]:
-    dataset = open_dataset(data)
-    return dataset, VertexBank(dataset, dataset.identities("evaluation")), load_trained(Path(run))[0]
+def _network(checkpoint: str) -> nn.Module:
+    return load_trained(Path(checkpoint))[0]
 
 
 def write_rows(rows: list[Row], path: Path) -> None:

@@ -4,17 +4,21 @@ Under torchrun: ``torchrun --nproc-per-node 2 -m training.launch RECIPE.yaml DAT
 """
 
 import json
+import signal
 import sys
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
-from training.ranks import TrainingError
+from training.ranks import STOP_FILE, TrainingError, TrainingStopped
 from training.recipe import TrainingRecipe
 from training.trainer import train
 
-_RESTARTS, _FAILURE = 3, "failure.json"
+_RESTARTS, _FAILURE, _MARK = 3, "failure.json", ".launch"
 
 
 def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
@@ -37,35 +41,38 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
 
 
 def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
-    import torch
     from ray.train import FailureConfig, RunConfig, ScalingConfig
-    from ray.train.torch import TorchTrainer
+    from ray.train.torch import TorchConfig, TorchTrainer
 
-    gpu = recipe.device != "cpu" and _cluster("GPU") > 0
-    if recipe.device == "cuda" and not (gpu or torch.cuda.is_available()):
-        raise TrainingError("training.device is 'cuda', but the cluster has no GPU. Use --set training.device=cpu")
+    gpu = _on_gpus(recipe)
+    if not gpu:
+        recipe = recipe.model_copy(update={"device": "cpu"})
     _require(recipe.ranks, "GPU" if gpu else "CPU")
-    failure = run / _FAILURE
-    failure.unlink(missing_ok=True)
+    run.mkdir(parents=True, exist_ok=True)
+    for left_over in (_FAILURE, STOP_FILE):
+        (run / left_over).unlink(missing_ok=True)
+    mark = uuid.uuid4().hex
+    write_atomically(run / _MARK, mark.encode())
     trainer = TorchTrainer(
         _rank,
-        train_loop_config={"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run)},
+        train_loop_config={"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark},
+        torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
         scaling_config=ScalingConfig(num_workers=recipe.ranks, use_gpu=gpu),
         run_config=RunConfig(
             name="ray", storage_path=str(run.resolve()), failure_config=FailureConfig(max_failures=_RESTARTS)
         ),
     )
     try:
-        trainer.fit()
+        with _passing_on_sigterm(run):
+            trainer.fit()
     except Exception as error:
-        raise TrainingError(
-            f"the training ranks died {_RESTARTS + 1} times; the last reason: {str(error).splitlines()[-1]}. "
+        raise _failure_of(run) or TrainingError(
+            f"the training ranks died {_RESTARTS + 1} times; the last reason: {str(error).strip().splitlines()[-1]}. "
             "Run the same command again to go on from the newest checkpoint"
         ) from error
-    if failure.exists():
-        reason = json.loads(failure.read_text())
-        failure.unlink()
-        raise TrainingError(reason["message"])
+    failure = _failure_of(run)
+    if failure:
+        raise failure
 
 
 def _rank(config: dict[str, Any]) -> None:
@@ -76,10 +83,50 @@ def _rank(config: dict[str, Any]) -> None:
     if (run / _FAILURE).exists():
         return
     try:
+        if not (run / _MARK).exists() or (run / _MARK).read_text() != config["mark"]:
+            raise TrainingError(f"this rank does not see {run} as the driver does: --out must be on a disk they share")
         train(TrainingRecipe.model_validate(config["recipe"]), data=config["data"], run=run)
     except DsffnetError as error:
-        write_atomically(run / _FAILURE, json.dumps({"message": str(error)}).encode())
+        if not (getattr(error, "secondary", False) and (run / _FAILURE).exists()):
+            about = {"message": str(error), "status": error.exit_status, "stopped": isinstance(error, TrainingStopped)}
+            write_atomically(run / _FAILURE, json.dumps(about).encode())
         raise
+
+
+def _failure_of(run: Path) -> TrainingError | None:
+    """What a rank left for the driver to say, with its exit status."""
+    try:
+        about = json.loads((run / _FAILURE).read_text())
+    except FileNotFoundError:
+        return None
+    (run / _FAILURE).unlink()
+    failure = (TrainingStopped if about["stopped"] else TrainingError)(about["message"])
+    failure.exit_status = about["status"]
+    return failure
+
+
+@contextmanager
+def _passing_on_sigterm(run: Path) -> Iterator[None]:
+    """While the block runs, SIGTERM to this process asks the ranks to finish their step, checkpoint and end."""
+    try:
+        before = signal.signal(signal.SIGTERM, lambda *_: (run / STOP_FILE).touch())
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        (run / STOP_FILE).unlink(missing_ok=True)
+
+
+def _on_gpus(recipe: TrainingRecipe) -> bool:
+    """Whether the ranks get GPUs: if asked for, or if there are enough of them and torch here can use them."""
+    import torch
+
+    if recipe.device == "cuda":
+        return True
+    return recipe.device == "auto" and _cluster("GPU") >= recipe.ranks and torch.cuda.is_available()
 
 
 def _cluster(resource: str) -> int:
@@ -103,7 +150,11 @@ def main() -> None:
 
     recipe_path, data, run = sys.argv[1:4]
     recipe = TrainingRecipe.model_validate(OmegaConf.to_container(OmegaConf.load(recipe_path)))
-    train(recipe, data=data, run=Path(run))
+    try:
+        train(recipe, data=data, run=Path(run))
+    except DsffnetError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        sys.exit(error.exit_status)
 
 
 if __name__ == "__main__":

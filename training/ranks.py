@@ -5,9 +5,11 @@ import datetime
 import os
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -17,11 +19,28 @@ from torch import Tensor
 from datagen.errors import DsffnetError
 from training.recipe import TrainingRecipe
 
-LOCK_SECONDS = 30.0  # how long to wait for the ranks of a killed driver to be gone
+_Answer = TypeVar("_Answer")
+STOP_FILE = "stop"
+LOCK_SECONDS = float(
+    os.environ.get("DSFFNET_LOCK_SECONDS", "30")
+)  # how long to wait for the ranks of a killed driver to be gone
 
 
 class TrainingError(DsffnetError):
-    """Training cannot go on: non-finite loss, too few CPUs, another process on the same run."""
+    """Training cannot go on: non-finite loss, too few CPUs, another process on the same run.
+
+    ``secondary`` marks what a rank says only because another rank failed.
+    """
+
+    def __init__(self, message: str, *, secondary: bool = False) -> None:
+        super().__init__(message)
+        self.secondary = secondary
+
+
+class TrainingStopped(TrainingError):
+    """Told to stop before the last step; a checkpoint was written. Its exit status is that of a program so ended."""
+
+    exit_status = 143
 
 
 @dataclass(frozen=True)
@@ -34,11 +53,13 @@ class Ranks:
 
     @classmethod
     def from_environment(cls) -> "Ranks":
+        """As torchrun and Ray Train say it; one process alone where they do not."""
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
         return cls(*(int(os.environ.get(name, default)) for name, default in zip(names, "010", strict=True)))
 
 
 def device_of(recipe: TrainingRecipe, ranks: Ranks) -> torch.device:
+    """The device of this rank; TrainingError if the recipe wants CUDA and there is none."""
     if recipe.device == "cpu" or (recipe.device == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     if not torch.cuda.is_available():
@@ -83,21 +104,68 @@ def process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone_in(run: Path, ranks: Ranks) -> Iterator[None]:
-    """One training a run: rank 0 holds a lock that the operating system drops if the process dies."""
-    if ranks.rank != 0:
-        yield
-        return
-    run.mkdir(parents=True, exist_ok=True)
+    """One training a run: rank 0 holds a lock that the operating system drops if the process dies.
+
+    Raises
+    ------
+    TrainingError
+        On every rank, if another process has it.
+    """
+    lock = FileLock(run / ".lock")
+
+    def acquire() -> None:
+        run.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=LOCK_SECONDS)
+        except Timeout as error:
+            raise TrainingError(
+                f"another process is training in {run}. Wait for it, or stop it, then run again"
+            ) from error
+
+    decided_by_first(ranks, acquire)
     try:
-        with FileLock(run / ".lock").acquire(timeout=LOCK_SECONDS):
-            yield
-    except Timeout as error:
-        raise TrainingError(f"another process is training in {run}. Wait for it, or stop it, then run again") from error
+        yield
+    finally:
+        lock.release()
 
 
-def stop_on_sigterm() -> threading.Event:
-    """An event that SIGTERM sets, where this thread may install a handler (Ray Train's workers may not)."""
-    stop = threading.Event()
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    return stop
+def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
+    """What rank 0 decides, on every rank; where it cannot, every rank raises."""
+    answer: list[Any] = [None, None]
+    failure: DsffnetError | None = None
+    if ranks.rank == 0:
+        try:
+            answer[0] = decide()
+        except DsffnetError as error:
+            failure, answer[1] = error, str(error)
+    if ranks.count > 1:
+        dist.broadcast_object_list(answer, src=0)
+    if failure:
+        raise failure
+    if answer[1] is not None:
+        raise TrainingError(answer[1], secondary=True)
+    return answer[0]
+
+
+class StopRequest:
+    """Whether this training was told to stop: by SIGTERM to this process, or by the file RUN/stop (for Ray's ranks)."""
+
+    def __init__(self, run: Path) -> None:
+        self._file, self._signalled, self._looked = run / STOP_FILE, threading.Event(), 0.0
+
+    def __enter__(self) -> "StopRequest":
+        with contextlib.suppress(ValueError):  # Ray Train runs ranks in a thread, which may not handle signals
+            self._before = signal.signal(signal.SIGTERM, lambda *_: self._signalled.set())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if hasattr(self, "_before"):
+            signal.signal(signal.SIGTERM, self._before)
+
+    def made(self) -> bool:
+        """Whether to stop after this step; looks for the file once a second."""
+        if time.monotonic() - self._looked > 1.0:
+            self._looked = time.monotonic()
+            if self._file.exists():
+                self._signalled.set()
+        return self._signalled.is_set()

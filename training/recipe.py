@@ -1,21 +1,31 @@
 """The typed recipes of training and evaluation."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from datagen.errors import RecipeError
 from datagen.recipe import Frozen
 
+Widths = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+
 
 class NetworkRecipe(Frozen):
     """The network; the defaults are the DSFFNet paper's (9,371,023 parameters)."""
 
     name: Literal["dsffnet"] = Field("dsffnet", description="network, see training.networks")
-    encoder_widths: tuple[int, int, int] = Field((64, 128, 1024), description="channels of the pose encoder's layers")
-    decoder_widths: tuple[int, int, int] = Field((256, 1024, 256), description="channels of the decoder's three blocks")
+    encoder_widths: Widths = Field((64, 128, 1024), description="channels of the pose encoder's layers")
+    decoder_widths: Widths = Field((256, 1024, 256), description="channels of the decoder's three blocks")
     feature_fusion: bool = Field(True, description="false: ablation w/o FFAdaIN (paper, Table 3)")
     target_side: bool = Field(True, description="false: ablation w/o the target side's own branch (paper, Table 3)")
+
+    @model_validator(mode="after")
+    def _something_modulates(self) -> "NetworkRecipe":
+        if not (self.feature_fusion or self.target_side):
+            raise ValueError(
+                "feature_fusion and target_side cannot both be false: nothing would be left to modulate by"
+            )
+        return self
 
 
 class ScheduleRecipe(Frozen):

@@ -94,7 +94,7 @@ def find_records(root: Path) -> list[Path]:
     found = {path.parent.resolve() for path in root.rglob(FILE)}
     for folder in list(found):
         record = read_record(folder)
-        if record and record.parent:
+        if record and record.parent and read_record((folder / record.parent).resolve()):
             found.add((folder / record.parent).resolve())
     return sorted(found, key=lambda folder: (_has_parent(folder), _start_of(folder)))
 

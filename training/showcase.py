@@ -8,7 +8,7 @@ from torch import nn
 from datagen.mesh import Mesh, bounding_box, save_mesh
 from datagen.store import Dataset
 from training.curves import training_curve
-from training.data import VertexBank
+from training.data import read_batch
 from training.evaluation import POSE_TYPES, Row, evaluation_list
 from training.figures import TransferExample, transfer_figure
 from training.inference import predict
@@ -21,13 +21,12 @@ def examples_of(
     dataset: Dataset, network: nn.Module, recipe: EvaluationRecipe, rows: list[Row]
 ) -> list[TransferExample]:
     """The first few triples of each evaluation list (not chosen by result), in metres, with their numbers."""
-    bank = VertexBank(dataset, dataset.identities("evaluation"))
     found = []
     for pose_type in POSE_TYPES:
         triples = evaluation_list(dataset, recipe, pose_type)[: recipe.examples]
         if not len(triples):
             continue
-        outputs = predict(network, bank.batch(triples)).double().numpy()
+        outputs = predict(network, read_batch(dataset, triples)).double().numpy()
         for place, (triple, output) in enumerate(zip(triples, outputs, strict=True)):
             found.append(_example(dataset, pose_type, place, [int(number) for number in triple], output, rows))
     return found

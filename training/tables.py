@@ -16,7 +16,8 @@ DEFINITIONS = """\
   same in both meshes, times 1e3.
 - **mm** mean Euclidean error of a vertex in millimetres, at the target identity's own size.
 - **edge** mean |output edge / true edge - 1|. **normal** mean angle between face normals, in degrees.
-- *target unchanged* and *source unchanged* are no-op baselines: what doing nothing would score."""
+- *target unchanged* and *source unchanged* are no-op baselines: what doing nothing would score. The second knows
+  more than the network: that source and target list corresponding vertices in one order, as they do in this data."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,11 @@ def markdown(lines: list[list[str]]) -> str:
     return "\n".join([texts[0], rule, *texts[1:]])
 
 
-def report(rows: list[Row], *, title: str, emd_points: int) -> str:
-    """The table as a Markdown document with its definitions."""
+def report(rows: list[Row], *, title: str, about: str, emd_points: int) -> str:
+    """The table as a Markdown document with its definitions; ``about`` says what was measured on what."""
     counts = {t: len({row.triple for row in rows if row.pose_type == t}) for t in POSE_TYPES}
     triples = ", ".join(f"{count} with {pose_type} poses" for pose_type, count in counts.items() if count)
     return (
-        f"# {title}\n\nNew identities; fixed triples: {triples}. Lower is better in every column.\n\n"
+        f"# {title}\n\n{about} New identities; fixed triples: {triples}. Lower is better in every column.\n\n"
         f"{markdown(summary(rows))}\n\n{DEFINITIONS.format(points=emd_points)}\n"
     )

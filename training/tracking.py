@@ -8,6 +8,7 @@ import hashlib
 import json
 import logging
 import os
+import shlex
 import shutil
 import tempfile
 import threading
@@ -61,8 +62,8 @@ def publish(root: Path, server: Server) -> None:
         log.debug("publishing %s failed", root, exc_info=True)
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise TrackingError(
-            f"MLflow at {server.uri} does not answer as it should ({reason}). Nothing is lost: "
-            f"dsffnet sync {root} --tracking-uri {server.uri} sends what is missing"
+            f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
+            f"dsffnet sync {shlex.quote(str(root))} --tracking-uri {shlex.quote(server.uri)} sends what is missing"
         ) from error
 
 
@@ -77,7 +78,7 @@ class _Publication:
         if not self._run_exists():
             self.sent = {"run": self._create_run(), "offsets": {}, "artifacts": {}}
             self._note()
-        self._once("parameters", self._send_parameters)
+        self._send_parameters()
         if self.record.tags != self.sent.get("tags", {}):
             self._send_tags()
         if self.record.dataset:
@@ -105,18 +106,28 @@ class _Publication:
         tags = {"kind": self.record.kind}
         if self.record.parent:
             parent = (self.folder / self.record.parent).resolve()
-            tags[_PARENT_TAG] = _read_sent(parent)[self.server.uri]["run"]
+            known = _read_sent(parent).get(self.server.uri)
+            if known:  # a run that was copied away from its workflow stands alone
+                tags[_PARENT_TAG] = known["run"]
         run = self.client.create_run(
             _experiment(self.client, self.server), start_time=self.record.started, run_name=self.record.name, tags=tags
         )
         return str(run.info.run_id)
 
     def _send_parameters(self) -> None:
-        from mlflow.entities import Param
+        """Parameters once; MLflow lets none change, so what a resumed run has otherwise becomes a tag."""
+        from mlflow.entities import Param, RunTag
 
-        items = [Param(key, value[:_LONGEST_PARAMETER]) for key, value in self.record.parameters.items()]
-        for start in range(0, len(items), _PARAMETERS_AT_ONCE):
-            self.client.log_batch(self.sent["run"], params=items[start : start + _PARAMETERS_AT_ONCE])
+        given = {key: value[:_LONGEST_PARAMETER] for key, value in self.record.parameters.items()}
+        sent = self.sent.get("parameters", {})
+        new = [Param(key, value) for key, value in given.items() if key not in sent]
+        for start in range(0, len(new), _PARAMETERS_AT_ONCE):
+            self.client.log_batch(self.sent["run"], params=new[start : start + _PARAMETERS_AT_ONCE])
+        tags = [RunTag(f"changed.{key}", value) for key, value in given.items() if sent.get(key, value) != value]
+        if tags:
+            self.client.log_batch(self.sent["run"], tags=tags)
+        if new or tags:
+            self._note(parameters=sent | given)
 
     def _send_tags(self) -> None:
         from mlflow.entities import RunTag
@@ -220,7 +231,7 @@ class _Publication:
         self._note(status=self.record.status)
 
     def _once(self, key: str, send: Any) -> None:
-        digest = hashlib.sha256(json.dumps([self.record.parameters, self.record.dataset]).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps(self.record.dataset).encode()).hexdigest()
         value = digest if key != "model" else self.record.model_version
         if self.sent.get(key) != value:
             send()

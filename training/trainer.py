@@ -16,21 +16,23 @@ from torch.nn.parallel import DistributedDataParallel
 
 from datagen.errors import DsffnetError
 from datagen.store import Dataset, open_dataset
-from training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from training.data import TripleOrder, VertexBank
+from training.checkpoint import CheckpointError, load_checkpoint, read_checkpoint, save_checkpoint
+from training.data import TripleOrder, VertexBank, read_batch
 from training.inference import network_from, predict
 from training.journal import Journal
 from training.losses import pose_transfer_loss
 from training.metrics import point_mesh_distance
 from training.ranks import (
     Ranks,
+    StopRequest,
     TrainingError,
+    TrainingStopped,
     alone_in,
     any_rank,
+    decided_by_first,
     device_of,
     mean_over_ranks,
     process_group,
-    stop_on_sigterm,
 )
 from training.recipe import TrainingRecipe
 
@@ -50,24 +52,35 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
     Returns
     -------
     int
-        The step reached (fewer than the recipe's steps only after SIGTERM).
+        The step reached, which is the recipe's last.
 
     Raises
     ------
+    TrainingStopped
+        After SIGTERM: the step was finished and a checkpoint written.
     TrainingError, DatasetError, CheckpointError, StorageError
         See their messages; the last good checkpoint is kept.
     """
     ranks = Ranks.from_environment()
-    with process_group(ranks, recipe), alone_in(run, ranks):
-        return _Trainer(recipe, open_dataset(data), run, ranks).run()
+    device = device_of(recipe, ranks)
+    with process_group(ranks, recipe), alone_in(run, ranks), StopRequest(run) as stop:
+        return _Trainer(recipe, open_dataset(data), run, ranks, device, stop).run()
 
 
 class _Trainer:
-    def __init__(self, recipe: TrainingRecipe, dataset: Dataset, run: Path, ranks: Ranks) -> None:
+    def __init__(
+        self,
+        recipe: TrainingRecipe,
+        dataset: Dataset,
+        run: Path,
+        ranks: Ranks,
+        device: torch.device,
+        stop: StopRequest,
+    ) -> None:
         if recipe.batch % ranks.count:
             raise TrainingError(f"batch {recipe.batch} cannot be shared equally by {ranks.count} ranks")
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
-        self.device = device_of(recipe, ranks)
+        self.device, self._stop, self.stopping = device, stop, False
         self.bank = VertexBank(dataset, dataset.identities("training"), device=self.device)
         self.order = TripleOrder(
             dataset.identities("training"), dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed
@@ -82,7 +95,6 @@ class _Trainer:
         self.done = self._resume()
         self.model = DistributedDataParallel(self.network) if ranks.count > 1 else self.network
         self.is_writer = ranks.rank == 0
-        self.stopping, self._stop = False, stop_on_sigterm()
 
     def run(self) -> int:
         journal = Journal(self.folder / "metrics.jsonl") if self.is_writer else None
@@ -93,18 +105,21 @@ class _Trainer:
             values = self.step(next(triples), meter)
             self.done += 1
             last = self.done == self.last_step
-            if self.done % self.recipe.log_every == 0 or last:
+            probing = self.done % self.recipe.evaluate_every == 0 or last
+            if probing or self.done % self.recipe.log_every == 0:
                 shared = mean_over_ranks(values, self.ranks)
                 if journal and probe:
-                    if self.done % self.recipe.evaluate_every == 0 or last:
-                        shared |= probe.measure(self.network)
+                    shared |= probe.measure(self.network) if probing else {}
                     journal.write(self.done, shared | meter.read())
-            if self.done % self.recipe.checkpoint_every == 0 or last:
+            if self.done % self.recipe.checkpoint_every == 0 or last or self.stopping:
                 self._save()
-        if self.stopping:
-            self._save()
         if journal:
             journal.close()
+        if self.done < self.last_step:
+            raise TrainingStopped(
+                f"stopped at step {self.done} of {self.last_step} as told; a checkpoint was written. "
+                "Run the same command again to go on from here"
+            )
         return self.done
 
     def step(self, triples: Any, meter: "_Meter") -> dict[str, Tensor | float]:
@@ -129,13 +144,14 @@ class _Trainer:
         """
         culprit = not bool(torch.isfinite(loss))
         bad = culprit or not bool(torch.isfinite(norm))
-        any_bad, self.stopping = any_rank([bad, self._stop.is_set()], self.ranks)
+        any_bad, self.stopping = any_rank([bad, self._stop.made()], self.ranks)
         if any_bad:
             elsewhere = "on another rank" if self.ranks.count > 1 else "in the gradient only"
             where = f"this rank's triples were {triples.tolist()}" if culprit else elsewhere
             raise TrainingError(
                 f"loss or gradient is not finite at step {self.done + 1} ({where}). "
-                "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip"
+                "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip",
+                secondary=not culprit,
             )
 
     def _save(self) -> None:
@@ -157,12 +173,18 @@ class _Trainer:
             except DsffnetError as error:
                 failure = error
         if any_rank([failure is not None], self.ranks)[0]:
-            raise failure or TrainingError("rank 0 could not write a checkpoint")
+            raise failure or TrainingError("rank 0 could not write a checkpoint", secondary=True)
+
+    def _newest(self) -> str | None:
+        found = load_checkpoint(self.folder)
+        return str(found.path) if found else None
 
     def _resume(self) -> int:
-        found = load_checkpoint(self.folder)
-        if found is None:
+        """The step to go on from. Rank 0 chooses the checkpoint, so that all ranks start from the same one."""
+        path = decided_by_first(self.ranks, self._newest)
+        if path is None:
             return 0
+        found = read_checkpoint(Path(path))
         if found.dataset != self.dataset.uuid:
             raise CheckpointError(
                 f"{self.folder} was trained on dataset {found.dataset}, not on {self.dataset.url} "
@@ -180,12 +202,11 @@ class _EvaluationProbe:
     """PMD on a small fixed part of the evaluation lists, for the training curve."""
 
     def __init__(self, dataset: Dataset, recipe: TrainingRecipe, device: torch.device) -> None:
-        bank = VertexBank(dataset, dataset.identities("evaluation"), device=device)
         self._batches = {}
         for pose_type in ("seen", "unseen"):
             triples = dataset.evaluation_triples(pose_type)[: recipe.evaluate_triples]
             if len(triples):
-                self._batches[pose_type] = bank.batch(triples)
+                self._batches[pose_type] = read_batch(dataset, triples).to(device)
 
     @torch.no_grad()
     def measure(self, network: nn.Module) -> dict[str, float]:

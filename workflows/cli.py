@@ -26,7 +26,7 @@ def generate_command(options: argparse.Namespace) -> None:
     from workflows.pipeline import generation_bar
 
     recipe = load_recipe(options.recipe, options.set).data
-    url = require_reachable(options.out, option="--out")
+    url = require_reachable(options.out, option="--out", urls=True)
     if options.local:
         generate(recipe, url, run=inline, progress=generation_bar, fresh=options.fresh)
     else:
@@ -74,30 +74,38 @@ def verify_command(options: argparse.Namespace) -> None:
 
 def train_command(options: argparse.Namespace) -> None:
     """Train on a dataset into a run folder, or go on with a training."""
+    from datagen.store import open_dataset
     from workflows.cluster import ray_cluster, require_reachable
-    from workflows.console import remove_run
-    from workflows.pipeline import train_stage
+    from workflows.console import alone_in, remove_run
+    from workflows.pipeline import check_run_accepts, train_stage
 
     recipe = load_recipe(options.recipe, options.set).training
     run = Path(require_reachable(options.out, option="--out"))
+    data = require_reachable(options.data, option="--data", urls=True)
+    check_run_accepts(recipe, open_dataset(data), run if not options.fresh else run / "none")
     if options.fresh:
-        remove_run(run)
+        with alone_in(run, ".driver.lock"):
+            remove_run(run)
     with _mirrored(run, options), ray_cluster():
-        train_stage(recipe, require_reachable(options.data, option="--data"), run, parent=None)
+        train_stage(recipe, data, run, parent=None)
     print(f"trained: {options.out}. Next: dsffnet evaluate {options.out} --data {options.data}")
 
 
 def evaluate_command(options: argparse.Namespace) -> None:
     """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run."""
+    from datagen.store import open_dataset
+    from training.checkpoint import require_checkpoint
     from training.record import read_record
     from workflows.cluster import ray_cluster, require_reachable
     from workflows.pipeline import evaluate_stage
 
     recipe = load_recipe(options.recipe, options.set).evaluation
     run = Path(require_reachable(options.run, option="RUN"))
+    require_checkpoint(run)
+    open_dataset(options.data)
     with _mirrored(run, options), ray_cluster():
         parent = run if read_record(run) else None
-        print(evaluate_stage(recipe, require_reachable(options.data, option="--data"), run, parent=parent))
+        print(evaluate_stage(recipe, require_reachable(options.data, option="--data", urls=True), run, parent=parent))
 
 
 def transfer_command(options: argparse.Namespace) -> None:

@@ -2,11 +2,13 @@
 
 import logging
 import os
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from datagen.errors import RecipeError
+from datagen.errors import ClusterError, RecipeError
 
 _ROOT = Path(__file__).resolve().parents[1]
 _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
@@ -22,15 +24,20 @@ if not on_cluster():
     os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
-def require_reachable(place: str, *, option: str) -> str:
+def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
     """A place that other machines and later processes can find; relative ones are made absolute on one machine only.
 
     Raises
     ------
     RecipeError
-        A relative path while running on a cluster, where the working directory is a throw-away copy.
+        A relative path while running on a cluster, where the working directory is a throw-away copy; or a URL where
+        only a folder will do.
     """
-    if "://" in place or os.path.isabs(place):
+    if "://" in place:
+        if urls:
+            return place
+        raise RecipeError(f"{option} {place!r} is a URL; runs are kept in a folder, on a disk that all machines share")
+    if os.path.isabs(place):
         return place
     if on_cluster():
         raise RecipeError(
@@ -51,7 +58,9 @@ def ray_cluster() -> Iterator[None]:
         yield
         return
     if on_cluster():
+        _require_head()
         ray.init(logging_level=logging.WARNING)
+        _wait_for_cpus()
     else:
         ray.init(
             address="local",
@@ -65,3 +74,28 @@ def ray_cluster() -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+
+
+def _require_head() -> None:
+    """Ask whether anybody listens where RAY_ADDRESS points; Ray itself would try for minutes without a word."""
+    host, _, port = os.environ.get("RAY_ADDRESS", "").rpartition(":")
+    if not port.isdigit() or "/" in host:
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=10).close()
+    except OSError as error:
+        raise ClusterError(
+            f"no Ray head answers at RAY_ADDRESS {host}:{port} ({error}). Start it (ray start --head), or unset "
+            "RAY_ADDRESS to run on this machine alone"
+        ) from error
+
+
+def _wait_for_cpus(seconds: float = 60.0) -> None:
+    """Wait a while for workers to join a cluster whose head has no CPUs of its own."""
+    import ray
+
+    until = time.monotonic() + seconds
+    while not ray.cluster_resources().get("CPU"):
+        if time.monotonic() > until:
+            raise ClusterError(f"the Ray cluster has had no CPUs for {seconds:.0f} s. Add one: ray start --address")
+        time.sleep(1.0)

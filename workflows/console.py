@@ -1,12 +1,13 @@
 """How the commands speak: options, errors in one line with an exit status, and the closing words."""
 
 import argparse
-import errno
 import logging
 import os
+import shlex
 import shutil
+import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,9 +15,15 @@ from filelock import FileLock, Timeout
 
 from datagen.errors import DsffnetError, RecipeError
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
+from workflows.cluster import require_reachable
 from workflows.recipe import describe_fields, known_recipes
 
-_OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr")
+log = logging.getLogger(__name__)
+_OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr", "system.jsonl")
+_OF_A_RUN = (
+    "recipe.yaml", "provenance.json", "record.json", "mlflow.json", "metrics.jsonl", "system.jsonl", "latest", "ray",
+    "checkpoints", "figures", "failure.json", "stop", ".launch",
+)  # fmt: skip
 
 
 class WorkflowError(DsffnetError):
@@ -26,9 +33,10 @@ class WorkflowError(DsffnetError):
 def guarded(main: Callable[[], None]) -> None:
     """Run a command; what a person can mend becomes one line on standard error and an exit status.
 
-    Status 0: done, 1: failed, 2: usage or an invalid recipe, 130: interrupted.
+    Status 0: done, 1: failed, 2: usage or an invalid recipe, 130: interrupted, 143: told to stop.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         main()
     except DsffnetError as error:
@@ -38,8 +46,7 @@ def guarded(main: Callable[[], None]) -> None:
         print("interrupted; run the same command again to go on from here", file=sys.stderr)
         sys.exit(130)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT):
-            raise
+        log.debug("as raised", exc_info=True)
         print(f"error: {error}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
         sys.exit(1)
 
@@ -88,13 +95,16 @@ def add_tracking_option(made: argparse.ArgumentParser) -> None:
 def server_of(out: Path, uri: str | None) -> Server:
     """The MLflow server to mirror to: as asked, as the environment says, or a SQLite store in ``out``."""
     uri = uri or os.environ.get("MLFLOW_TRACKING_URI")
-    if uri:
-        if uri.startswith("sqlite:///") and not uri.startswith("sqlite:////"):
-            uri = f"sqlite:///{os.path.abspath(uri.removeprefix('sqlite:///'))}"
-        return Server(uri)
-    out = out.absolute()
-    out.mkdir(parents=True, exist_ok=True)
-    return Server(f"sqlite:///{out / 'mlflow.db'}", artifacts=out / "mlartifacts")
+    if uri and uri.startswith("sqlite:///"):
+        place = require_reachable(uri.removeprefix("sqlite:///"), option="--tracking-uri sqlite:///")
+        return _sqlite(Path(place))
+    return Server(uri) if uri else _sqlite(out.absolute() / "mlflow.db")
+
+
+def _sqlite(database: Path) -> Server:
+    """A SQLite store with its artifacts beside it."""
+    database.parent.mkdir(parents=True, exist_ok=True)
+    return Server(f"sqlite:///{database}", artifacts=database.parent / "mlartifacts")
 
 
 def server_of_record(root: Path, uri: str | None) -> Server:
@@ -105,21 +115,32 @@ def server_of_record(root: Path, uri: str | None) -> Server:
 
 
 def remove_run(run: Path) -> None:
-    """Remove a training run.
+    """Remove what a training keeps in its folder.
 
     Raises
     ------
     RecipeError
-        The folder does not look like a run.
+        The folder is not a training run's.
     """
-    if run.exists() and any(run.iterdir()) and not (run / "record.json").exists():
-        raise RecipeError(f"{run} holds files but no run of ours, so --fresh leaves it alone. Choose another --out")
-    shutil.rmtree(run, ignore_errors=True)
+    record = read_record(run)
+    if run.exists() and any(run.iterdir()) and (record is None or record.kind != "train"):
+        raise RecipeError(f"{run} is not the folder of a training, so --fresh leaves it alone. Choose another --out")
+    _remove(run, _OF_A_RUN)
+    for folder in run.glob("evaluation*"):
+        shutil.rmtree(folder)
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    for path in (folder / name for name in names):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 @contextmanager
-def alone_in(out: Path) -> Iterator[None]:
-    """Hold a workflow's folder; the operating system gives it back if this process dies.
+def alone_in(out: Path, name: str = ".lock") -> Iterator[None]:
+    """Hold the folder of a workflow or a run; the operating system gives it back if this process dies.
 
     Raises
     ------
@@ -128,10 +149,10 @@ def alone_in(out: Path) -> Iterator[None]:
     """
     out.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(out / ".lock").acquire(timeout=0):
+        with FileLock(out / name).acquire(timeout=0):
             yield
     except Timeout as error:
-        raise WorkflowError(f"another workflow is running in {out}. Wait for it, or stop it, then run again") from error
+        raise WorkflowError(f"another command is at work in {out}. Wait for it, or stop it, then run again") from error
 
 
 def start_over(out: Path) -> None:
@@ -149,14 +170,8 @@ def start_over(out: Path) -> None:
         raise RecipeError(
             f"{out} holds files but no workflow of ours, so --fresh leaves it alone. Choose another --out"
         )
-    for name in _OWN:
-        path = out / name
-        if name == "dataset.zarr":
-            remove(str(path))
-        elif path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+    remove(str(out / "dataset.zarr"))
+    _remove(out, (name for name in _OWN if name != "dataset.zarr"))
 
 
 def _programs() -> str:
@@ -172,15 +187,15 @@ def closing_words(out: Path, server: Server) -> str:
     evaluation = out / "run" / "evaluation"
     table = (evaluation / "tables.md").read_text()
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-    run = shown / "run"
+    run = shlex.quote(str(shown / "run"))
     here = shown / "run" / "evaluation"
-    meshes = here / "meshes"
+    meshes = shlex.quote(str(here / "meshes"))
     programs = _programs()
     dsffnet = f"{programs}dsffnet"
     ui = (
         f"make ui OUT={shown}"
-        if server.uri.startswith("sqlite")
-        else f"open {server.uri} in a browser (experiment {EXPERIMENT!r})"
+        if server.uri == f"sqlite:///{out / 'mlflow.db'}"
+        else f"look at MLflow ({server.uri}), experiment {EXPERIMENT!r}"
     )
     return f"""
 {table}

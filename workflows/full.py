@@ -22,11 +22,21 @@ from functools import partial
 
 from datagen.errors import DsffnetError
 from datagen.store import open_dataset
+from datagen.store.schema import open_group
+from datagen.store.writer import check_same_recipe
 from training.record import read_record, update_record
 from training.tracking import Mirror
 from workflows.cluster import ray_cluster, require_reachable
 from workflows.console import alone_in, closing_words, guarded, server_of, start_over, workflow_parser
-from workflows.pipeline import evaluate_stage, generate_stage, is_evaluated, is_trained, recorded, train_stage
+from workflows.pipeline import (
+    check_run_accepts,
+    evaluate_stage,
+    generate_stage,
+    is_evaluated,
+    is_trained,
+    recorded,
+    train_stage,
+)
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
 from workflows.stages import Stage, run_stage
 
@@ -56,6 +66,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
     """All stages of a recipe into the folder ``out``; finished ones are skipped, without so much as starting Ray."""
     data, run = str(out / "dataset.zarr"), out / "run"
     sections = recipe.model_dump(mode="json")
+    _refuse_conflicts(recipe, data, run)
     with ExitStack() as around:
         begin = _once(lambda: _begin(around, recipe, out))
         generate = Stage(
@@ -73,11 +84,19 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
         evaluate = Stage(
             "evaluate",
             depends_on=[sections["data"], sections["training"], sections["evaluation"]],
-            intact=lambda: is_evaluated(run),
+            intact=lambda: is_evaluated(recipe.evaluation, data, run),
             work=partial(_evaluate, recipe, data, run, out),
         )
         for stage in (generate, train, evaluate):
             run_stage(stage, out=out, before=begin)
+
+
+def _refuse_conflicts(recipe: WorkflowRecipe, data: str, run: Path) -> None:
+    """Refuse a folder whose dataset or run was made by another recipe, before anything in it is touched."""
+    if (Path(data) / "zarr.json").exists():
+        check_same_recipe(data, open_group(data), recipe.data)
+        if _is_complete(data):
+            check_run_accepts(recipe.training, open_dataset(data), run)
 
 
 def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path) -> None:

@@ -17,16 +17,18 @@ from datagen.mesh import bounding_box, write_atomically
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
-from training.checkpoint import load_checkpoint
+from training.checkpoint import CheckpointError, load_checkpoint, require_checkpoint
 from training.data import TripleOrder
 from training.evaluation import NO_OPS, Row, evaluate, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
 from training.launch import launch
+from training.ranks import TrainingError, TrainingStopped
 from training.recipe import EvaluationRecipe, TrainingRecipe
-from training.record import MODEL, begin_record, end_record, flatten, update_record
+from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
+from workflows.console import alone_in
 from workflows.progress import bar, following, sampling
 
 METHOD = "DSFFNet"
@@ -38,7 +40,7 @@ def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, paramet
     begin_record(folder, name=name, kind=kind, parent=parent, parameters=flatten(parameters))
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit, TrainingStopped):
         end_record(folder, "KILLED")
         raise
     except BaseException:
@@ -74,21 +76,33 @@ def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Pat
 def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | None) -> None:
     """Train to the recipe's last step, from the newest checkpoint if there is one."""
     dataset = open_dataset(data)
-    with recorded(run, kind="train", name="train", parent=parent, parameters=recipe.model_dump(mode="json")):
-        update_record(run, dataset=about_dataset(dataset), artifacts=["recipe.yaml", "provenance.json"])
-        _write_run_head(recipe, dataset, run)
-        with following(run / "metrics.jsonl", steps=last_step(recipe, dataset), system=run / "system.jsonl"):
-            launch(recipe, data=data, run=run)
-        draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
-        artifacts = ["recipe.yaml", "provenance.json", "metrics.jsonl", "figures"]
-        update_record(
-            run, artifacts=artifacts, model=MODEL, model_version=f"{dataset.uuid} step {last_step(recipe, dataset)}"
+    check_run_accepts(recipe, dataset, run)
+    about = recorded(run, kind="train", name="train", parent=parent, parameters=recipe.model_dump(mode="json"))
+    with alone_in(run, ".driver.lock"), about:
+        _train(recipe, dataset, run)
+
+
+def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+    artifacts = ["recipe.yaml", "provenance.json"]
+    update_record(run, dataset=about_dataset(dataset), artifacts=artifacts)
+    _write_run_head(recipe, dataset, run)
+    steps = last_step(recipe, dataset)
+    with following(run / "metrics.jsonl", steps=steps, system=run / "system.jsonl"):
+        launch(recipe, data=dataset.url, run=run)
+    reached = require_checkpoint(run).step
+    if reached < steps:
+        raise TrainingError(
+            f"training in {run} ended at step {reached} of {steps}. Run the same command again to go on"
         )
+    draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
+    version = f"{dataset.uuid} step {reached}"
+    update_record(run, artifacts=[*artifacts, "metrics.jsonl", "figures"], model=MODEL, model_version=version)
 
 
 def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Path | None) -> str:
-    """Measure the run, write rows, tables, figures, meshes and viewer to RUN/evaluation; returns the report."""
-    folder, dataset = run / "evaluation", open_dataset(data)
+    """Measure the run, write rows, tables, figures, meshes and viewer; returns the report."""
+    dataset, (network, _, step) = open_dataset(data), load_trained(run)
+    folder = evaluation_folder(run, dataset)
     with recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=recipe.model_dump(mode="json")):
         with sampling(folder / "system.jsonl"):
             progress = partial(bar, what="evaluate", unit="task")
@@ -96,13 +110,13 @@ def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Pa
                 run, data, recipe, tasks=ray_runner, method=METHOD, progress=lambda chunks, n: progress(chunks, total=n)
             )
         write_rows(rows, folder / "rows.csv")
-        text = report(rows, title=_title(dataset), emd_points=_emd_points(recipe, dataset))
+        about = f"Weights of step {step:,} on {Path(dataset.url).name} ({dataset.uuid})."
+        text = report(rows, title=_title(dataset), about=about, emd_points=_emd_points(recipe, dataset))
         write_atomically(folder / "tables.md", text.encode())
-        network, _, _ = load_trained(run)
         draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
         baselines = {
-            f"{name} ({pose_type})": mean_of(rows, method=name, pose_type=pose_type, field="pmd")
-            for name, pose_type in ((NO_OPS[0], "unseen"), (NO_OPS[1], "unseen"))
+            f"{name} (unseen)": mean_of(rows, method=name, pose_type="unseen", field="pmd")
+            for name in NO_OPS
             if name in methods_of(rows)
         }
         draw_training_curve(run, folder / "figures" / "training-curve.png", baselines=baselines)
@@ -115,6 +129,31 @@ def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Pa
     return text
 
 
+def evaluation_folder(run: Path, dataset: Dataset) -> Path:
+    """RUN/evaluation for the dataset that the run was trained on, RUN/evaluation-NAME for any other."""
+    own = require_checkpoint(run).dataset == dataset.uuid
+    return run / ("evaluation" if own else f"evaluation-{Path(dataset.url).stem}")
+
+
+def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+    """Refuse a run that learned by another recipe or on other data, before anything in it is touched.
+
+    Raises
+    ------
+    CheckpointError, RecipeError
+        It did; the message says what differs.
+    """
+    found = load_checkpoint(run)
+    if found is None:
+        return
+    if found.dataset != dataset.uuid:
+        raise CheckpointError(
+            f"{run} was trained on dataset {found.dataset}, not on {dataset.url} ({dataset.uuid}). "
+            "Choose another --out, or add --fresh to start over"
+        )
+    recipe.require_same_learning(TrainingRecipe.model_validate(found.recipe), where=str(run))
+
+
 def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
     """The step at which a training of this recipe on this dataset ends."""
     identities = dataset.identities("training")
@@ -123,18 +162,26 @@ def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
 
 
 def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
-    """Whether a run holds a sound checkpoint of the recipe's last step on this dataset."""
+    """Whether a run holds a sound checkpoint of this recipe's last step on this dataset."""
     try:
-        dataset, checkpoint = open_dataset(data), load_checkpoint(run)
-        return checkpoint is not None and checkpoint.step >= last_step(recipe, dataset)
+        dataset, found = open_dataset(data), load_checkpoint(run)
+        check_run_accepts(recipe, dataset, run)
+        return found is not None and found.step >= last_step(recipe, dataset)
     except DsffnetError:
         return False
 
 
-def is_evaluated(run: Path) -> bool:
-    """Whether the outputs of an evaluation are there."""
+def is_evaluated(recipe: EvaluationRecipe, data: str, run: Path) -> bool:
+    """Whether the outputs of this evaluation on this dataset are there."""
     names = ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png")
-    return all((run / "evaluation" / name).is_file() for name in names)
+    record = read_record(run / "evaluation")
+    try:
+        same = record is not None and record.dataset == about_dataset(open_dataset(data))
+    except DsffnetError:
+        return False
+    wanted = flatten(recipe.model_dump(mode="json"))
+    same = same and record is not None and record.parameters == wanted and record.status == "FINISHED"
+    return same and all((run / "evaluation" / name).is_file() for name in names)
 
 
 def summary_metrics(rows: list[Row]) -> dict[str, float]:

@@ -48,7 +48,7 @@ def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRec
         merged = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(list(overrides)))
         values = OmegaConf.to_container(merged, resolve=True)
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
-        raise RecipeError(f"recipe {path} cannot be read: {error}") from error
+        raise RecipeError(f"recipe {path} cannot be read: {_first_line(error)}") from error
     return check_recipe(values, where=str(name_or_file))
 
 
@@ -60,8 +60,8 @@ def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
     RecipeError
         With one line a fault: which key, what is wrong, what was given.
     """
-    if not isinstance(values, dict):
-        raise RecipeError(f"recipe {where} is not a mapping of sections (data, training, evaluation)")
+    if not isinstance(values, dict) or not values:
+        raise RecipeError(f"recipe {where} is not a mapping of sections (data, training, evaluation), or is empty")
     try:
         return WorkflowRecipe.model_validate(values)
     except ValidationError as error:
@@ -108,6 +108,10 @@ def _describe(fault: Any) -> str:
     if fault["type"] == "extra_forbidden":
         return f"unknown key {key!r}{_nearest(key, [line.split()[0] for line in describe_fields()])}"
     return f"{key}: {fault['msg']} (given: {fault['input']!r})"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _nearest(name: str, known: list[str]) -> str:

@@ -19,6 +19,7 @@ from datagen.store.schema import (
     check_version,
     identity_name,
     open_group,
+    stored_recipe,
     stored_sizes,
     vertices_path,
 )
@@ -38,10 +39,12 @@ class Dataset:
 
     @cached_property
     def recipe(self) -> DatasetRecipe:
-        return DatasetRecipe.model_validate(self.attributes["recipe"])
+        """The recipe that the dataset was made by."""
+        return stored_recipe(self.url, self.group)
 
     @cached_property
     def grid(self) -> Grid:
+        """The identity x pose grid of the recipe."""
         return Grid(self.recipe)
 
     @property

@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 import zarr
+from pydantic import ValidationError
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from datagen.errors import DatasetError
 from datagen.grid import Shard
+from datagen.recipe import DatasetRecipe
 
 FORMAT_VERSION = 1
 
@@ -94,6 +96,26 @@ def attributes_of(group: zarr.Group) -> dict[str, Any]:
     return dict(group.attrs.asdict())
 
 
+def stored_recipe(url: str, group: zarr.Group) -> DatasetRecipe:
+    """The recipe in a dataset's attributes.
+
+    Raises
+    ------
+    DatasetError
+        There is none, or this program does not understand it.
+    """
+    stored = attributes_of(group).get("recipe")
+    if stored is None:
+        raise DatasetError(f"{url} holds no recipe. Make it anew: dsffnet generate --recipe RECIPE --out {url} --fresh")
+    try:
+        return DatasetRecipe.model_validate(stored)
+    except ValidationError as error:
+        raise DatasetError(
+            f"{url} holds a recipe that this program does not understand ({error.error_count()} faults). "
+            "Read it with the version that made it, or make it anew with --fresh"
+        ) from error
+
+
 def read_bytes(group: zarr.Group, path: str) -> bytes | None:
     """Raw bytes of one object of the dataset's store, or None where there is none."""
     found = sync(group.store.get(_key(group, path), default_buffer_prototype()))
@@ -138,9 +160,11 @@ def open_group(url: str, *, mode: str = "r") -> zarr.Group:
         raise DatasetError(
             f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}"
         ) from error
+    except ImportError as error:
+        raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
     except (ValueError, KeyError, OSError) as error:
         raise DatasetError(
-            f"{url} is not a readable dataset ({error}). Make it anew: dsffnet generate ... --fresh"
+            f"{url} is not a readable dataset ({error}). Name a folder that dsffnet generate made"
         ) from error
 
 

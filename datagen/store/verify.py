@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.errors import DatasetError
 from datagen.grid import Grid, Shard
 from datagen.recipe import DatasetRecipe
 from datagen.store.reader import read_manifest
@@ -21,6 +20,7 @@ from datagen.store.schema import (
     open_group,
     read_bytes,
     shard_path,
+    stored_recipe,
     stored_sizes,
     vertices_path,
 )
@@ -82,7 +82,7 @@ def describe(url: str) -> dict[str, Any]:
     group = open_group(url)
     check_version(url, group)
     attributes = attributes_of(group)
-    recipe = DatasetRecipe.model_validate(attributes["recipe"])
+    recipe = stored_recipe(url, group)
     grid = Grid(recipe)
     shards = grid.shards()
     sizes = stored_sizes(group, [shard_path(shard) for shard in shards])
@@ -116,16 +116,7 @@ def _vertex_counts(group: zarr.Group, grid: Grid) -> str:
 
 
 def require_recipe(url: str) -> DatasetRecipe:
-    """The recipe stored with a dataset of any status.
-
-    Raises
-    ------
-    DatasetError
-        No dataset there, or one whose attributes were never written.
-    """
+    """The recipe stored with a dataset of any status (DatasetError where there is none that can be read)."""
     group = open_group(url)
     check_version(url, group)
-    recipe = attributes_of(group).get("recipe")
-    if recipe is None:
-        raise DatasetError(f"{url} holds no recipe. Make it anew: dsffnet generate --recipe RECIPE --out {url} --fresh")
-    return DatasetRecipe.model_validate(recipe)
+    return stored_recipe(url, group)

@@ -37,6 +37,7 @@ from datagen.store.schema import (
     open_group,
     read_bytes,
     shard_path,
+    stored_recipe,
     vertices_path,
 )
 
@@ -63,7 +64,8 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
     with _writing(url):
         group = open_group(url, mode="a")
         if "format_version" in group.attrs:
-            _check_same_recipe(url, group, recipe)
+            check_same_recipe(url, group, recipe)
+            _check_same_assets(url, group, body)
         else:
             group.attrs.update(_attributes(recipe, body))
         _create_arrays(group, recipe, body)
@@ -73,7 +75,8 @@ def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray
     """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
     with _writing(url):
         group = open_group(url, mode="r+")
-        delete_object(group, shard_path(shard))  # zarr would read a damaged one first where it reaches past the array
+        if read_bytes(group, shard_path(shard)) is not None and existing_shard(url, shard) is None:
+            delete_object(group, shard_path(shard))  # zarr would read it first, where a shard reaches past the array
         array = array_at(group, vertices_path(shard.identity))
         array[shard.start : shard.stop] = vertices
     row = existing_shard(url, shard)
@@ -193,12 +196,26 @@ def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
         return False
 
 
-def _check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
+def _check_same_assets(url: str, group: zarr.Group, body: BodyModel) -> None:
+    stored, present = attributes_of(group)["body"]["assets"], [vars(asset) for asset in body.assets]
+    if stored != present:
+        raise DatasetError(
+            f"{url} was made from {_named(stored)}, but {_named(present)} is installed. Install that version, or "
+            "write to another place, or add --fresh to make it anew"
+        )
+
+
+def _named(assets: Sequence[dict[str, Any]]) -> str:
+    return ", ".join(f"{asset['name']} {asset['version']}" for asset in assets)
+
+
+def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
+    """Refuse to go on with a dataset that another recipe (or version) began; the message names what differs."""
     check_version(url, group)
     attributes = attributes_of(group)
     if attributes["recipe_sha256"] == recipe.sha256():
         return
-    stored = DatasetRecipe.model_validate(attributes["recipe"])
+    stored = stored_recipe(url, group)
     changed = ", ".join(_differences(stored.model_dump(mode="json"), recipe.model_dump(mode="json")))
     raise DatasetError(
         f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"

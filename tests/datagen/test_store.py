@@ -43,7 +43,7 @@ def test_what_is_read_is_what_was_made(dataset: str) -> None:
     assert opened.identities("evaluation") == [3, 4]
 
 
-def test_xarray_opens_it(dataset: str) -> None:
+def test_dimensions_are_named(dataset: str) -> None:
     names = zarr.open_group(dataset, mode="r")["identity/0000/vertices"].metadata.dimension_names
     assert names == ("row", "vertex", "coordinate")
 
@@ -148,7 +148,7 @@ def test_recipe_changed_between_runs(spoilable: Path) -> None:
 
 def test_fresh_never_removes_what_is_not_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(DatasetError, match="not a dataset, so it is not removed"):
+    with pytest.raises(DatasetError, match="holds what is not a dataset"):
         generate(tiny_dataset(), str(tmp_path), fresh=True)
     assert (tmp_path / "thesis.txt").read_text() == "precious"
 
@@ -194,3 +194,41 @@ def test_made_in_part_then_copied_elsewhere_it_is_finished_there(dataset: str, s
     shutil.move(spoilable, moved)
     generate(tiny_dataset(), str(moved))
     assert tree_hash(moved) == tree_hash(dataset)
+
+
+def test_a_dataset_is_never_written_among_other_files_nor_removed_with_them(dataset: str, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(DatasetError, match=r"holds what is not a dataset \(thesis.txt\)"):
+        generate(tiny_dataset(), str(tmp_path))
+    made = tmp_path / "leg.zarr"
+    shutil.copytree(dataset, made)
+    (made / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match=r"notes.txt"):
+        generate(tiny_dataset(), str(made), fresh=True)
+    assert (made / "notes.txt").exists() and (tmp_path / "thesis.txt").exists()
+
+
+def test_a_file_where_the_dataset_should_go(tmp_path: Path) -> None:
+    (tmp_path / "x.zarr").write_text("a file")
+    with pytest.raises(DatasetError, match="is a file"):
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), fresh=True)
+
+
+def test_repair_refuses_to_commit_other_bytes(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.bodies.leg import LegModel
+
+    first_shard(spoilable).unlink()
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
+    with pytest.raises(DatasetError, match="was made again, but not the same"):
+        repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+
+
+def test_other_assets_are_refused_when_going_on(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.bodies import Asset
+    from datagen.bodies.leg import LegModel
+
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "2"),))
+    with pytest.raises(DatasetError, match="was made from procedural leg 1, but procedural leg 2 is installed"):
+        generate(tiny_dataset(), str(spoilable))

@@ -46,7 +46,7 @@ def test_a_damaged_newest_falls_back_and_says_so(tmp_path: Path, caplog, spoil, 
 def test_none_or_all_damaged(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     flip_bit(save(tmp_path, 1) / "weights.safetensors")
-    with pytest.raises(CheckpointError, match=r"no usable checkpoint\. Train first: dsffnet train"):
+    with pytest.raises(CheckpointError, match=r"no usable checkpoint\. Name the folder of a training"):
         require_checkpoint(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""Triples: what they must be (REFERENCE, section 1), and in which order they come."""
+"""Triples: what they must be (DSFFNet, section 4.1), and in which order they come."""
 
 import numpy as np
 import pytest

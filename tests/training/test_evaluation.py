@@ -11,8 +11,7 @@ from datagen.generate import inline
 from datagen.mesh import Mesh, bounding_box
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
-from training import evaluation
-from training.checkpoint import CheckpointError
+from training.checkpoint import CheckpointError, require_checkpoint
 from training.evaluation import NO_OPS, Row, evaluate, measure_chunk, read_rows, write_rows
 from training.recipe import EvaluationRecipe
 from training.tables import markdown, mean_of, methods_of, report, summary
@@ -25,7 +24,6 @@ RECIPE = EvaluationRecipe(emd_points=16, chunk=3)
 @pytest.fixture
 def run(dataset: str, tmp_path: Path) -> Path:
     train(tiny_training(), data=dataset, run=tmp_path / "run")
-    evaluation._loaded.cache_clear()
     return tmp_path / "run"
 
 
@@ -60,7 +58,7 @@ def test_any_cutting_into_tasks_gives_the_same_rows(dataset: str, run: Path) -> 
 
 
 def test_rows_survive_csv(dataset: str, run: Path, tmp_path: Path) -> None:
-    rows = measure_chunk(str(run), dataset, RECIPE, "DSFFNet", "seen", 0)
+    rows = measure_chunk(str(require_checkpoint(run).path), dataset, RECIPE, "DSFFNet", "seen", 0)
     write_rows(rows, tmp_path / "rows.csv")
     assert read_rows(tmp_path / "rows.csv") == rows
 
@@ -75,7 +73,7 @@ def test_the_table_means_what_it_says() -> None:
     lines = summary(rows)
     assert lines[1] == ["seen", "DSFFNet", "2.00", "2.00", "1000.00", "200.00", "3.0", "0.040", "5.0"]
     assert [line[1] for line in lines[1:]] == ["DSFFNet", "target unchanged"]
-    text = report(rows, title="T", emd_points=64)
+    text = report(rows, title="T", about="A.", emd_points=64)
     assert "2 with seen poses" in text and "assignment (exact) of 64 vertices" in text
     widths = {len(line) for line in markdown(lines).splitlines()}
     assert len(widths) == 1, "columns line up"

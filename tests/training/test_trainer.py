@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from datagen.errors import DatasetError, DsffnetError, RecipeError, StorageError
 from datagen.generate import generate
+from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit
 from tests.support.ranks import finish, start_ranks
 from tests.support.recipes import tiny_dataset, tiny_training
-from training import checkpoint, ranks
+from training import ranks
 from training.checkpoint import CheckpointError, require_checkpoint
 from training.journal import read_journal
 from training.ranks import Ranks, TrainingError, alone_in
@@ -127,23 +129,55 @@ def test_sigterm_finishes_the_step_and_checkpoints(dataset: str, tmp_path: Path)
     began = time.monotonic()
     rank.send_signal(signal.SIGTERM)
     ((status, output),) = finish(started, timeout=30)
-    assert status == 0, output
+    assert status == 143 and "stopped at step" in output, output
     assert time.monotonic() - began < 15
     assert require_checkpoint(run).step == read_journal(run / "metrics.jsonl")[-1]["step"]
 
 
-def test_disk_full_at_checkpoint_time(dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, calls = checkpoint.save_file, iter(range(10))
+def test_disk_full_at_checkpoint_time(dataset: str, tmp_path: Path) -> None:
+    """On a real file system that fills up: one error, and the last good checkpoint stays."""
+    recipe = tiny_training(steps=40, keep_checkpoints=40)
+    with small_disk(tmp_path / "disk", kibibytes=200) as disk:
+        with pytest.raises(StorageError, match=r"could not write .*step-0000.*Earlier checkpoints are kept"):
+            train(recipe, data=dataset, run=disk / "run")
+        kept = require_checkpoint(disk / "run")
+        assert kept.step >= 4 and not list((disk / "run" / "checkpoints").glob(".partial-*"))
+        grow(disk, kibibytes=20_000)
+        assert train(recipe, data=dataset, run=disk / "run") == 40
 
-    def full(*arguments: object) -> None:
-        if next(calls) >= 1:
-            raise OSError(28, "No space left on device")
-        real(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(checkpoint, "save_file", full)
-    with pytest.raises(StorageError, match="No space left on device"):
-        train(tiny_training(), data=dataset, run=tmp_path / "run")
-    assert require_checkpoint(tmp_path / "run").step == 4
+def test_all_ranks_start_from_the_checkpoint_that_rank_0_chooses(dataset: str, tmp_path: Path) -> None:
+    """While the ranks wait for a dying driver's rank 0 to let go, it writes one more checkpoint."""
+    recipe = tiny_training(launcher="ray", ranks=2, steps=12)
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    finish(start_ranks(recipe, data=dataset, run=whole, count=2))
+    newest = whole / "checkpoints" / "step-00000008"
+    shutil.copytree(whole, run)
+    for name in ("step-00000008", "step-00000012"):
+        shutil.rmtree(run / "checkpoints" / name)
+    with FileLock(run / ".lock"):
+        started = start_ranks(recipe, data=dataset, run=run, count=2)
+        time.sleep(6)
+        shutil.copytree(newest, run / "checkpoints" / newest.name)
+    assert [status for status, _ in finish(started)] == [0, 0]
+    assert same_bits(run, whole)
+
+
+def test_a_run_that_is_in_use_fails_on_every_rank(
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DSFFNET_LOCK_SECONDS", "1")
+    (tmp_path / "run").mkdir()
+    with FileLock(tmp_path / "run" / ".lock"):
+        recipe = tiny_training(launcher="ray", ranks=2)
+        results = finish(start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2), timeout=60)
+    assert all(status == 1 and "another process is training in" in output for status, output in results), results
+
+
+def test_probes_come_when_they_are_due_whatever_is_logged(dataset: str, tmp_path: Path) -> None:
+    train(tiny_training(steps=24, log_every=3, evaluate_every=4), data=dataset, run=tmp_path / "run")
+    rows = read_journal(tmp_path / "run" / "metrics.jsonl")
+    assert [row["step"] for row in rows if "evaluation/pmd_seen" in row] == [4, 8, 12, 16, 20, 24]
 
 
 def test_another_dataset_or_recipe_is_refused(dataset: str, undisturbed: Path, tmp_path: Path) -> None:

@@ -149,13 +149,46 @@ def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
 
 def test_two_workflows_in_one_folder(tmp_path: Path) -> None:
     with alone_in(tmp_path / "w"):
-        fails(command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another workflow is running")
+        fails(
+            command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another command is at work in"
+        )
 
 
 def test_fresh_leaves_other_peoples_files_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
     fails(command("--recipe", "smoke", "--out", tmp_path, "--fresh", script="full.py"), 2, "leaves it alone")
     assert (tmp_path / "thesis.txt").exists()
+
+
+def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    from training.record import begin_record
+
+    begin_record(tmp_path / "workflow", name="w", kind="workflow", parent=None, parameters={})
+    (tmp_path / "workflow" / "dataset.txt").write_text("precious")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("precious")
+    for place in ("workflow", "other"):
+        result = command("train", "--recipe", "smoke", "--data", trained[0], "--out", tmp_path / place, "--fresh")
+        fails(result, 2, "is not the folder of a training, so --fresh leaves it alone")
+    assert (tmp_path / "workflow" / "dataset.txt").exists() and (tmp_path / "other" / "thesis.txt").exists()
+
+
+def test_more_bad_input_is_one_line(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    data, _ = trained
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "empty.yaml").write_text("")
+    fails(command("--recipe", "smoke", "--out", tmp_path / "file", script="full.py"), 1, "file")
+    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file" / "x.zarr"), 1, "file")
+    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file", "--fresh"), 1, "is a file")
+    fails(command("recipe", "--recipe", tmp_path / "empty.yaml"), 2, "or is empty")
+    fails(command("recipe", "--set", "training.network.encoder_widths=[0,8,8]"), 2, "encoder_widths.0", "given: 0")
+    fails(command("recipe", "--set", "training.learning_rate=.inf"), 2, "training.learning_rate")
+    fails(command("recipe", "--set", "training.steps=${nothing}"), 2, "cannot be read")
+    fails(command("train", "--data", data, "--out", "s3://bucket/run"), 2, "is a URL")
+    fails(command("evaluate", tmp_path / "norun", "--data", data), 1, "norun has no usable checkpoint")
+    assert not (tmp_path / "norun").exists()
+    silent = command("generate", "--recipe", "smoke", "--out", tmp_path / "y.zarr", RAY_ADDRESS="127.0.0.1:1")
+    fails(silent, 1, "no Ray head answers at RAY_ADDRESS 127.0.0.1:1")
 
 
 def test_printed_recipe_can_be_used_as_a_file(tmp_path: Path) -> None:
