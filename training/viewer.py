@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from datagen.mesh import write_atomically
 from training.figures import (
     ERROR_COLORS,
     ROLE_COLORS,
@@ -77,7 +78,8 @@ def write_viewer(
         data=_inert_json(payload),
         bundle=licence + _asset("viewer.bundle.js"),
     )
-    return _written(page, path)
+    write_atomically(Path(path), page.encode())
+    return Path(path)
 
 
 def viewer_payload(examples: Sequence[TransferExample], *, error_scale: ErrorScale) -> dict[str, Any]:
@@ -178,16 +180,3 @@ def _inert_json(payload: dict[str, Any]) -> str:
 @cache
 def _asset(name: str) -> str:
     return (files("training") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _written(text: str, path: str | os.PathLike[str]) -> Path:
-    """Write under a temporary name and rename, so that a reader never meets half a page."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path

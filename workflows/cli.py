@@ -51,7 +51,7 @@ def verify_command(options: argparse.Namespace) -> None:
     from datagen.generate import inline, repair
     from datagen.grid import Grid
     from datagen.store.verify import find_faults, require_recipe
-    from workflows.pipeline import generation_bar
+    from workflows.pipeline import generation_bar, is_complete
     from workflows.progress import bar
 
     recipe = require_recipe(options.dataset)
@@ -61,7 +61,7 @@ def verify_command(options: argparse.Namespace) -> None:
     )
     for fault in faults:
         print(f"fault: {fault.path}: {fault.reason}")
-    complete = _is_complete(options.dataset)
+    complete = is_complete(options.dataset)
     if not faults and complete:
         print(f"{options.dataset} is whole")
         return
@@ -247,16 +247,6 @@ def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
         outage = mirror.close()
     if outage:
         raise outage
-
-
-def _is_complete(url: str) -> bool:
-    from datagen.store import open_dataset
-
-    try:
-        open_dataset(url)
-    except DatasetError:
-        return False
-    return True
 
 
 def _print_facts(facts: dict[str, str]) -> None:

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 
-from datagen.errors import DsffnetError
 from datagen.store import open_dataset
 from datagen.store.schema import open_group
 from datagen.store.writer import check_same_recipe
@@ -32,6 +31,7 @@ from workflows.pipeline import (
     check_run_accepts,
     evaluate_stage,
     generate_stage,
+    is_complete,
     is_evaluated,
     is_trained,
     recorded,
@@ -72,7 +72,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
         generate = Stage(
             "generate",
             depends_on=sections["data"],
-            intact=lambda: _is_complete(data),
+            intact=lambda: is_complete(data),
             work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out),
         )
         train = Stage(
@@ -93,10 +93,13 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
 
 def _refuse_conflicts(recipe: WorkflowRecipe, data: str, run: Path) -> None:
     """Refuse a folder whose dataset or run was made by another recipe, before anything in it is touched."""
-    if (Path(data) / "zarr.json").exists():
-        check_same_recipe(data, open_group(data), recipe.data)
-        if _is_complete(data):
-            check_run_accepts(recipe.training, open_dataset(data), run)
+    if not (Path(data) / "zarr.json").exists():
+        return
+    group = open_group(data)
+    if "format_version" in group.attrs:  # it is missing where the very first write was cut short
+        check_same_recipe(data, group, recipe.data)
+    if is_complete(data):
+        check_run_accepts(recipe.training, open_dataset(data), run)
 
 
 def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path) -> None:
@@ -126,14 +129,6 @@ def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path) -> None:
 def _once(work: Callable[[], None]) -> Callable[[], None]:
     waiting = [work]
     return lambda: waiting.pop()() if waiting else None
-
-
-def _is_complete(data: str) -> bool:
-    try:
-        open_dataset(data)
-    except DsffnetError:
-        return False
-    return True
 
 
 if __name__ == "__main__":

@@ -161,6 +161,15 @@ def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
     return recipe.steps or recipe.epochs * order.steps_per_epoch
 
 
+def is_complete(data: str) -> bool:
+    """Whether a complete dataset is there, none of its shards missing."""
+    try:
+        open_dataset(data)
+    except DsffnetError:
+        return False
+    return True
+
+
 def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
     """Whether a run holds a sound checkpoint of this recipe's last step on this dataset."""
     try:
