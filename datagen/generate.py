@@ -5,6 +5,7 @@ makes and writes it; so a run after any interruption does only what is missing, 
 """
 
 import contextlib
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -24,6 +25,9 @@ from datagen.store.reader import Dataset, open_dataset, read_manifest
 from datagen.store.schema import ManifestRow, open_group
 from datagen.store.verify import Fault, find_faults
 from datagen.store.writer import begin, existing_shard, finish, identity_parameters, write_shard
+
+log = logging.getLogger(__name__)
+_SILENCE = 120.0  # seconds without a finished task before a person is told
 
 Task = Callable[[str, DatasetRecipe, Any], Any]
 Runner = Callable[[Task, list[tuple[Any, ...]]], Iterator[Any]]
@@ -82,8 +86,11 @@ def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         while waiting or running:
             while waiting and len(running) < window:
                 running.add(remote.remote(*waiting.pop()))
-            done, running = map(set, ray.wait(list(running), num_returns=1))
-            yield ray.get(done.pop())
+            done, running = map(set, ray.wait(list(running), num_returns=1, timeout=_SILENCE))
+            if done:
+                yield ray.get(done.pop())
+            else:
+                log.warning("no task has finished for %.0f s; are all CPUs of the Ray cluster in use?", _SILENCE)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from error
     except ray.exceptions.RayError as error:

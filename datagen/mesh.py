@@ -1,5 +1,6 @@
 """Meshes: normalisation, edges, and the one place where mesh files are read and written."""
 
+import io
 import os
 import tempfile
 from dataclasses import dataclass
@@ -72,10 +73,9 @@ def load_mesh(path: str | Path) -> Mesh:
 def _single_geometry(path: Path) -> Mesh:
     import trimesh
 
-    is_obj = path.suffix.lower() == ".obj"  # materials and groups must not split its one list of vertices
     try:
-        options = {"group_material": False, "split_object": False, "skip_materials": True} if is_obj else {}
-        scene = trimesh.load_scene(path, process=False, maintain_order=True, **options)
+        source: Any = _plain_obj(path) if path.suffix.lower() == ".obj" else path
+        scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, maintain_order=True)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     except Exception as error:  # trimesh's readers raise whatever their parsers raise
         raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
@@ -84,6 +84,18 @@ def _single_geometry(path: Path) -> Mesh:
     if not parts:
         raise MeshError(f"{path} holds no triangles (a point cloud, or an empty file?)")
     return Mesh(np.asarray(parts[0].vertices, np.float64), np.asarray(parts[0].faces, np.int64))
+
+
+def _plain_obj(path: Path) -> io.BytesIO:
+    """Positions and faces of an OBJ file. Materials, groups and texture seams would split its one list of vertices."""
+    kept = []
+    for line in path.read_bytes().replace(b"\\\n", b" ").splitlines():
+        words = line.split()
+        if words and words[0] == b"v":
+            kept.append(line)
+        elif words and words[0] == b"f":
+            kept.append(b" ".join([b"f", *(word.split(b"/")[0] for word in words[1:])]))
+    return io.BytesIO(b"\n".join(kept) + b"\n")
 
 
 def check_mesh(mesh: Mesh, *, name: str) -> Mesh:

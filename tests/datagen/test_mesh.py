@@ -80,3 +80,15 @@ def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="could not write"):
         save_mesh(TETRAHEDRON, tmp_path / "file" / "mesh.obj")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_obj_with_materials_groups_and_texture_seams_keeps_its_one_list_of_vertices(tmp_path: Path) -> None:
+    """As bodies from artists' tools come: skin and clothes as materials, a vertex with two texture coordinates."""
+    (tmp_path / "person.mtl").write_text("newmtl skin\nnewmtl cloth\n")
+    (tmp_path / "person.obj").write_text(
+        "mtllib person.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
+        "g torso\nusemtl skin\nf 1/1 2/2 3/3\ng legs\nusemtl cloth\nf 1/4 3/3 4/2\nf 2/1 4/4 3/2\n"
+    )
+    mesh = load_mesh(tmp_path / "person.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 3, 2]]
