@@ -208,10 +208,10 @@ class _Publication:
                 signature=_signature(),
                 pip_requirements=["torch", "safetensors", "numpy", "scipy", "pydantic", "filelock", "zarr", "trimesh"],
             )
-        name, version = self.record.model, self._register_version(model.model_uri)
+        name, version = self.record.model, self._register_version(model.model_uri, model.model_id)
         self.client.set_registered_model_alias(name, ALIAS, version)
 
-    def _register_version(self, source: str) -> str:
+    def _register_version(self, source: str, model: str) -> str:
         """As log_model's own registration, which prints into the progress bars."""
         from mlflow.exceptions import MlflowException
 
@@ -220,7 +220,7 @@ class _Publication:
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-        version = self.client.create_model_version(self.record.model, source, self.sent["run"])
+        version = self.client.create_model_version(self.record.model, source, self.sent["run"], model_id=model)
         return str(version.version)
 
     def _send_status(self) -> None:
