@@ -4,6 +4,7 @@ Under torchrun: ``torchrun --nproc-per-node 2 -m training.launch RECIPE.yaml DAT
 """
 
 import json
+import os
 import signal
 import sys
 import uuid
@@ -154,7 +155,9 @@ def main() -> None:
         train(recipe, data=data, run=Path(run))
     except DsffnetError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
-        sys.exit(error.exit_status)
+        sys.stdout.flush()
+        # The group is not left after an error, and taking the interpreter down with its threads alive can abort (-6).
+        os._exit(error.exit_status)
 
 
 if __name__ == "__main__":
