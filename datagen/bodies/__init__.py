@@ -4,7 +4,6 @@ To add a family: one module here that defines a class with the members of :class
 in :mod:`datagen.recipe`, and one line in ``FAMILIES``. The contract tests then cover it.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from typing import Protocol
@@ -12,46 +11,65 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.assets import Asset
+from datagen.errors import BodyError
+from datagen.poses import Poses, PoseSource
 from datagen.recipe import Body
 
 
-@dataclass(frozen=True)
-class Asset:
-    """What a body model was made from: a package or a file, its licence and its hash or version."""
-
-    name: str
-    licence: str
-    version: str
-
-
 class BodyModel(Protocol):
-    """A parametric body: identity parameters and a pose over SMPL's 24 named joints in, vertices out."""
+    """A body: identity parameters and poses over named joints in, vertices out.
+
+    ``joints`` are the pose joints that it understands: a dataset whose poses turn any other is refused.
+    """
 
     parameter_names: tuple[str, ...]
+    joints: tuple[str, ...]
     assets: tuple[Asset, ...]
 
-    def draw_identity(self, random: np.random.Generator) -> NDArray[np.float64]:
-        """Identity parameters [parameter], named by ``parameter_names``."""
+    def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
+        """Parameters [parameter] of identity number ``identity``, named by ``parameter_names``."""
         ...
 
     def faces(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
         """Triangles [face, 3] of that identity (families may differ between identities)."""
         ...
 
-    def vertices(self, parameters: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Vertices [pose, vertex, 3] in metres, Y up, facing +Z.
-
-        ``poses`` is axis-angle [pose, 24, 3] in radians (see :mod:`datagen.poses`).
-        """
+    def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
+        """Vertices [pose, vertex, 3] in metres, Y up, facing +Z."""
         ...
 
 
-FAMILIES = {"anny": "datagen.bodies.anny:AnnyModel", "leg": "datagen.bodies.leg:LegModel"}
+FAMILIES = {
+    "anny": "datagen.bodies.anny:AnnyModel",
+    "smpl": "datagen.bodies.smpl:SmplModel",
+    "smal": "datagen.bodies.smal:SmalModel",
+    "rigged": "datagen.bodies.rigged:RiggedModel",
+    "imported": "datagen.bodies.imported:ImportedModel",
+    "mixed": "datagen.bodies.mixed:MixedModel",
+    "leg": "datagen.bodies.leg:LegModel",
+}
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def load_body(recipe: Body) -> BodyModel:
     """The body model of a recipe, loaded once a process."""
     module, name = FAMILIES[recipe.family].split(":")
     model: BodyModel = getattr(import_module(module), name)(recipe)
     return model
+
+
+def require_joints(body: BodyModel, source: PoseSource, *, family: str) -> None:
+    """Refuse poses that turn joints which the body does not have: it would silently stand otherwise than the rest.
+
+    Raises
+    ------
+    BodyError
+        With the joints that are lacking.
+    """
+    lacking = [joint for joint in source.joints if joint not in body.joints]
+    if lacking:
+        raise BodyError(
+            f"the poses turn joints that the body family {family!r} lacks: {', '.join(lacking)}. It has "
+            f"{', '.join(body.joints) or 'none'}. Choose poses for it: --set data.poses.distribution.name=..."
+        )

@@ -2,8 +2,7 @@
 
 Anny rests in an A-pose, Z up, facing -Y. Poses here are SMPL's (T-pose, Y up, facing +Z), so that one pose draws
 alike on Anny and on the SMPL family: the vertices are first turned to SMPL's axes, and every arm joint carries a
-fixed correction C that takes its A-pose bone to the T-pose. With SMPL rotations R, the rotation that the rig needs
-relative to its parent is C_parent^-1 R C_joint (then world rotation = world SMPL rotation times C_joint).
+fixed correction C that takes its A-pose bone to the T-pose: its world rotation is that of the SMPL joint times C.
 """
 
 import contextlib
@@ -18,10 +17,10 @@ from filelock import FileLock
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from datagen.bodies import Asset
+from datagen.assets import Asset
 from datagen.bodies.skinning import Rest, skin
 from datagen.errors import BodyError
-from datagen.poses import JOINTS
+from datagen.poses import JOINTS, Poses
 from datagen.recipe import AnnyBody
 
 _RIG = "mixamo"
@@ -47,6 +46,8 @@ def rig_joints(joint: str) -> tuple[str, ...]:
 class AnnyModel:
     """See :class:`datagen.bodies.BodyModel`; frame: metres, Y up, facing +Z, +X to the body's left."""
 
+    joints = JOINTS
+
     def __init__(self, recipe: AnnyBody) -> None:
         self._model = _load_anny(recipe.topology)
         self.parameter_names = tuple(self._model.phenotype_labels)
@@ -56,9 +57,11 @@ class AnnyModel:
         self._weights = self._model.dense_vertex_bone_weights.numpy().astype(np.float64)
         self._parents = [int(parent) for parent in self._model.bone_parents]
         self._bones = [label.split(":")[-1] for label in self._model.bone_labels]
+        smpl = {bone: joint for joint in JOINTS for bone in rig_joints(joint)}
+        self._names = [smpl.get(bone) for bone in self._bones]
         self._correction = self._t_pose_corrections()
 
-    def draw_identity(self, random: np.random.Generator) -> NDArray[np.float64]:
+    def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Phenotype parameters, uniform within the recipe's ranges."""
         return np.array([random.uniform(low, high) for low, high in self._ranges])
 
@@ -66,9 +69,9 @@ class AnnyModel:
         """Triangles [face, 3]; the same for all identities."""
         return self._faces
 
-    def vertices(self, parameters: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32, feet and all where the body model puts them (no grounding)."""
-        return skin(self._rest(parameters), self._rotations(poses))
+        return skin(self._rest(parameters), poses.on(self._names, self._parents) @ self._correction)
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         import torch
@@ -83,17 +86,6 @@ class AnnyModel:
         if not (np.isfinite(vertices).all() and np.isfinite(joints).all()):
             raise BodyError(f"Anny gave a body with non-finite coordinates for the phenotypes {parameters.tolist()}")
         return Rest(vertices, joints, self._weights, self._parents)
-
-    def _rotations(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """SMPL axis-angle [pose, 24, 3] -> rotations of Anny's bones relative to their parents [pose, bone, 3, 3]."""
-        rotations = np.tile(np.eye(3), (len(poses), len(self._bones), 1, 1))
-        for joint, name in enumerate(JOINTS):
-            matrices = Rotation.from_rotvec(poses[:, joint]).as_matrix()
-            rotations[:, [self._bones.index(bone) for bone in rig_joints(name)]] = matrices[:, None]
-        for bone, parent in enumerate(self._parents):
-            before = np.eye(3) if parent < 0 else self._correction[parent].T
-            rotations[:, bone] = before @ rotations[:, bone] @ self._correction[bone]
-        return rotations
 
     def _t_pose_corrections(self) -> NDArray[np.float64]:
         """World rotations [bone, 3, 3] that take the template's A-pose arms to SMPL's T-pose; identity elsewhere."""

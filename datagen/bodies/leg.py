@@ -6,11 +6,10 @@ family is added. Identity: length, thigh and ankle radius, knee height. It obeys
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from datagen.bodies import Asset
+from datagen.assets import Asset
 from datagen.bodies.skinning import Rest, skin
-from datagen.poses import JOINTS
+from datagen.poses import JOINTS, Poses
 from datagen.recipe import LegBody
 
 _RANGES = {"length": (0.7, 1.1), "thigh_radius": (0.06, 0.14), "ankle_radius": (0.03, 0.06), "knee": (0.45, 0.6)}
@@ -21,12 +20,13 @@ class LegModel:
     """See :class:`datagen.bodies.BodyModel`; frame: metres, Y up, facing +Z, the hip at the origin."""
 
     parameter_names = tuple(_RANGES)
+    joints = JOINTS  # all but two of which move nothing: it is one leg
     assets = (Asset("procedural leg", "Apache-2.0", "1"),)
 
     def __init__(self, recipe: LegBody) -> None:
         self._rings, self._segments = recipe.rings, recipe.segments
 
-    def draw_identity(self, random: np.random.Generator) -> NDArray[np.float64]:
+    def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
         return np.array([random.uniform(low, high) for low, high in _RANGES.values()])
 
@@ -44,11 +44,10 @@ class LegModel:
         last = (self._rings - 1) * self._segments
         return np.concatenate([*side, fan.T[:, ::-1], fan.T + last]).astype(np.int32)
 
-    def vertices(self, parameters: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32."""
-        chosen = poses[:, [JOINTS.index(bone) for bone in _BONES]]
-        rotations = Rotation.from_rotvec(chosen.reshape(-1, 3)).as_matrix().reshape(len(poses), 2, 3, 3)
-        return skin(self._rest(parameters), rotations)
+        rest = self._rest(parameters)
+        return skin(rest, poses.on(_BONES, rest.parents))
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters

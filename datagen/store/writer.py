@@ -50,7 +50,7 @@ _PACKAGES = ("anny", "numpy", "scipy", "zarr", "numcodecs")
 
 def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
     """Parameters [parameter] of identity number ``identity``, a function of (seed, identity) alone."""
-    return body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, identity))
+    return body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, identity), identity)
 
 
 def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:

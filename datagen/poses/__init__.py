@@ -1,0 +1,107 @@
+"""Poses over named joints, and where they come from.
+
+A pose is one axis-angle vector (radians) for each joint of a named tree, relative to the joint's parent, in axes
+aligned with the rest pose: for people SMPL's 24 joints, body at rest in a T-pose, Y up, facing +Z, +X to the body's
+left. Bodies carry it over to their own joints by name (:meth:`Poses.on`), so that one pose draws alike on all of them.
+
+To add a source: one module here that defines a class with the members of :class:`PoseSource`, its section in
+:mod:`datagen.recipe`, and one line in ``SOURCES``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datagen.assets import Asset
+from datagen.poses.skeletons import JOINTS, PARENTS
+from datagen.recipe import PoseRecipe
+
+__all__ = ["JOINTS", "PARENTS", "SOURCES", "PoseSource", "Poses", "draw_poses", "load_poses"]
+
+_GRID = 2.0**20  # rotations are rounded to this, so that sines that differ in their last bit give the same meshes
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Some poses: axis-angle ``rotations`` [pose, joint, 3] in radians over the tree of ``joints`` and ``parents``."""
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    rotations: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def __getitem__(self, poses: slice) -> "Poses":
+        return Poses(self.joints, self.parents, self.rotations[poses])
+
+    def world(self) -> NDArray[np.float64]:
+        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes."""
+        matrices = Rotation.from_rotvec(self.rotations.reshape(-1, 3)).as_matrix()
+        world = matrices.reshape(*self.rotations.shape[:2], 3, 3)
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                world[:, joint] = world[:, parent] @ world[:, joint]
+        return np.round(world * _GRID) / _GRID
+
+    def on(self, names: Sequence[str | None], parents: Sequence[int]) -> NDArray[np.float64]:
+        """World rotations [pose, joint, 3, 3] for another joint tree, whose joints are called ``names``.
+
+        A joint whose name these poses do not have (or None) follows its parent; a root without one stays as it is.
+        """
+        known = {name: number for number, name in enumerate(self.joints)}
+        mine, world = self.world(), np.empty((len(self), len(names), 3, 3))
+        for joint, (name, parent) in enumerate(zip(names, parents, strict=True)):
+            if name in known:
+                world[:, joint] = mine[:, known[name]]
+            else:
+                world[:, joint] = world[:, parent] if parent >= 0 else np.eye(3)
+        return world
+
+
+class PoseSource(Protocol):
+    """Where poses come from: pose number p is a function of the recipe, its assets and p alone."""
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    assets: tuple[Asset, ...]
+
+    def draw(self, pose: int) -> NDArray[np.float64]:
+        """Pose number ``pose``: axis-angle [joint, 3] in radians."""
+        ...
+
+
+SOURCES = {
+    "npt": "datagen.poses.ranges:NptSource",
+    "ranges": "datagen.poses.ranges:RangeSource",
+    "found": "datagen.poses.ranges:FoundSource",
+    "clips": "datagen.poses.clips:ClipSource",
+    "amass": "datagen.poses.files:AmassSource",
+    "file": "datagen.poses.files:FileSource",
+}
+
+
+def load_poses(recipe: PoseRecipe) -> PoseSource:
+    """The pose source of a recipe, loaded once a process."""
+    return _load(recipe.model_dump_json())
+
+
+@lru_cache(maxsize=8)
+def _load(recipe: str) -> PoseSource:
+    parsed = PoseRecipe.model_validate_json(recipe)
+    module, name = SOURCES[parsed.distribution.name].split(":")
+    source: PoseSource = getattr(import_module(module), name)(parsed)
+    return source
+
+
+def draw_poses(recipe: PoseRecipe, poses: NDArray[np.integer] | range) -> Poses:
+    """The poses of the given numbers."""
+    source = load_poses(recipe)
+    drawn = [source.draw(int(pose)) for pose in poses]
+    return Poses(source.joints, source.parents, np.stack(drawn) if drawn else np.empty((0, len(source.joints), 3)))
