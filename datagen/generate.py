@@ -4,27 +4,23 @@ The driver asks for every shard of the grid. A task returns the manifest row of 
 makes and writes it; so a run after any interruption does only what is missing, and the bytes come out the same.
 """
 
-import contextlib
 import logging
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-from datagen.bodies import load_body
+from datagen.bodies import load_body, require_joints
 from datagen.errors import BodyError, ClusterError, DatasetError
 from datagen.grid import Grid, Shard
-from datagen.poses import draw_poses
-from datagen.recipe import DatasetRecipe
+from datagen.places import is_local, remove, require_ours, writing_alone
+from datagen.poses import draw_poses, load_poses
+from datagen.recipe import DatasetRecipe, Growth
 from datagen.store.reader import Dataset, open_dataset, read_manifest
-from datagen.store.schema import ManifestRow, open_group
+from datagen.store.schema import ManifestRow, open_group, stored_recipe
 from datagen.store.verify import Fault, find_faults
-from datagen.store.writer import begin, existing_shard, finish, identity_parameters, write_shard
+from datagen.store.writer import begin, existing_shard, finish, grow, identity_parameters, write_shard
 
 log = logging.getLogger(__name__)
 _SILENCE = 120.0  # seconds without a finished task before a person is told
@@ -58,12 +54,16 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
 
 def ensure_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow:
     """The manifest row of a shard, which is made and written first unless it is there and sound."""
-    return existing_shard(url, shard) or write_shard(url, recipe, shard, make_shard(recipe, shard))
+    return existing_shard(url, recipe, shard) or write_shard(url, recipe, shard, make_shard(recipe, shard))
 
 
-def prepare(url: str, recipe: DatasetRecipe, _: None = None) -> None:
-    """Load the body model and create the dataset's metadata."""
-    begin(url, recipe, load_body(recipe.body))
+def prepare(url: str, recipe: DatasetRecipe, growing: bool = False) -> None:
+    """Load the body model and the poses, check that they fit, and create the dataset's metadata."""
+    body, poses = load_body(recipe.body), load_poses(recipe.poses)
+    require_joints(body, poses, family=recipe.body.family)
+    if growing:
+        grow(url, recipe, body)
+    begin(url, recipe, body)
 
 
 def inline(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
@@ -142,16 +142,59 @@ def generate(
     return open_dataset(url)
 
 
+def append(
+    url: str,
+    *,
+    training: int | None = None,
+    evaluation: int | None = None,
+    seen: int | None = None,
+    unseen: int | None = None,
+    run: Runner = inline,
+    progress: Progress = lambda rows, grid: rows,
+) -> Dataset:
+    """Give an existing dataset more identities or poses, up to these totals; no shard that is there is touched.
+
+    The totals make it repeatable: the same call again goes on after an interruption, and does nothing when done.
+    The result is, byte for byte, what the grown recipe makes from nothing.
+
+    Raises
+    ------
+    DatasetError
+        There is no dataset, it is unfinished, or it has more than a total already.
+    """
+    recipe = stored_recipe(url, open_group(url))
+    grown = _grown(url, recipe, {"training": training, "evaluation": evaluation, "seen": seen, "unseen": unseen})
+    if grown == recipe:
+        return generate(recipe, url, run=run, progress=progress)
+    open_dataset(url)  # an unfinished one must be finished first, and says how
+    with writing_alone(url):
+        _make_missing(grown, url, run, progress, growing=True)
+    return open_dataset(url)
+
+
+def _grown(url: str, recipe: DatasetRecipe, totals: dict[str, int | None]) -> DatasetRecipe:
+    steps = Grid(recipe).steps
+    present = {name: sum(getattr(step, name) for step in steps) for name in totals}
+    more = {name: total - present[name] for name, total in totals.items() if total is not None}
+    for name, count in more.items():
+        if count < 0:
+            raise DatasetError(
+                f"{url} has {present[name]} {name}, more than {totals[name]}; appending does not take away. "
+                "Name a larger total, or make a new dataset with dsffnet generate"
+            )
+    return recipe.model_copy(update={"growth": (*recipe.growth, Growth(**more))}) if any(more.values()) else recipe
+
+
 def _complete(url: str, recipe: DatasetRecipe) -> bool:
     try:
-        return open_dataset(url).recipe == recipe
+        return open_dataset(url).recipe.sha256() == recipe.sha256()
     except DatasetError:
         return False
 
 
-def _make_missing(recipe: DatasetRecipe, url: str, run: Runner, progress: Progress) -> None:
+def _make_missing(recipe: DatasetRecipe, url: str, run: Runner, progress: Progress, *, growing: bool = False) -> None:
     grid = Grid(recipe)
-    list(run(prepare, [(url, recipe, None)]))
+    list(run(prepare, [(url, recipe, growing)]))
     finish(url, list(progress(run(ensure_shard, [(url, recipe, shard) for shard in grid.shards()]), grid)))
 
 
@@ -165,7 +208,7 @@ def repair(
 ) -> Dataset:
     """Make the faulty shards again and check that the dataset is whole; the others are not touched."""
     with writing_alone(url):
-        list(run(prepare, [(url, recipe, None)]))
+        list(run(prepare, [(url, recipe)]))
         before = {row.path: row.sha256 for row in read_manifest(open_group(url))}
         for row in run(_remake, [(url, recipe, fault.shard) for fault in faults if fault.shard]):
             if before.get(row.path, row.sha256) != row.sha256:
@@ -182,58 +225,3 @@ def repair(
 
 def _remake(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow:
     return write_shard(url, recipe, shard, make_shard(recipe, shard))
-
-
-def is_local(url: str) -> bool:
-    """Whether a store URL is a folder of a file system."""
-    return "://" not in url
-
-
-def remove(url: str) -> None:
-    """Remove a dataset; nothing happens where there is none.
-
-    Raises
-    ------
-    DatasetError
-        The place holds something that is not a dataset, or a remote store, which is for its owner to remove.
-    """
-    if not is_local(url):
-        raise DatasetError(f"--fresh removes local datasets only; remove {url} with your storage's own tools")
-    require_ours(url)
-    shutil.rmtree(url, ignore_errors=not Path(url).exists())
-
-
-def require_ours(url: str) -> None:
-    """Refuse a local place that holds anything but a dataset of ours.
-
-    Raises
-    ------
-    DatasetError
-        It is a file, or a folder with other things in it.
-    """
-    path = Path(url)
-    if path.is_file():
-        raise DatasetError(f"{url} is a file, not a dataset. Choose another --out")
-    strangers = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")} if path.exists() else set()
-    if strangers - _MEMBERS:
-        raise DatasetError(
-            f"{url} holds what is not a dataset ({sorted(strangers - _MEMBERS)[0]}). Choose another --out"
-        )
-
-
-_MEMBERS = {"zarr.json", "topology", "identity", "pose", "evaluation", "manifest"}
-
-
-@contextlib.contextmanager
-def writing_alone(url: str) -> Iterator[None]:
-    """Hold the right to write to a local dataset; the operating system gives it back if this process dies."""
-    if not is_local(url):
-        yield
-        return
-    lock = FileLock(f"{os.path.abspath(url)}.lock")
-    try:
-        Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
-        with lock.acquire(timeout=0):
-            yield
-    except Timeout as error:
-        raise DatasetError(f"another process is writing to {url}. Wait for it, or stop it, then run again") from error

@@ -20,6 +20,7 @@ from datagen.recipe import DatasetRecipe, Growth
 
 PoseType = Literal["seen", "unseen"]
 Split = Literal["training", "evaluation"]
+POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 HOLE = -1
 """The pose number of a row that holds no mesh."""
 
@@ -60,14 +61,16 @@ class Grid:
     def _splits(self) -> list[Split]:
         found: list[Split] = []
         for step in self.steps:
-            found += ["training"] * step.training + ["evaluation"] * step.evaluation
+            found.extend("training" for _ in range(step.training))
+            found.extend("evaluation" for _ in range(step.evaluation))
         return found
 
     @cached_property
     def _pose_types(self) -> list[PoseType]:
         found: list[PoseType] = []
         for step in self.steps:
-            found += ["seen"] * step.seen + ["unseen"] * step.unseen
+            found.extend("seen" for _ in range(step.seen))
+            found.extend("unseen" for _ in range(step.unseen))
         return found
 
     @property

@@ -34,8 +34,7 @@ class Batch:
 def read_batch(dataset: Dataset, triples: NDArray[np.integer]) -> Batch:
     """The normalised meshes of rows (source identity, source pose, target identity, target pose), and only those.
 
-    Poses are row numbers of the identities, as they are for every identity of a generated grid. For a few triples of
-    a large dataset; :class:`VertexBank` is for many.
+    For a few triples of a large dataset; :class:`VertexBank` is for many.
     """
     source_identity, source_pose, target_identity, target_pose = triples.T
     return Batch(
@@ -66,11 +65,12 @@ class VertexBank:
             )
         self.faces = dataset.faces(identities[0])
         self.edges = torch.from_numpy(edges_of(self.faces)).to(device)
-        self._first: dict[int, int] = {}
+        self._places: dict[int, NDArray[np.int64]] = {}
         meshes, rows = [], 0
         for identity in identities:
             vertices = dataset.vertices(identity)
-            self._first[identity] = rows
+            self._places[identity] = np.full(dataset.grid.pose_count, -1)
+            self._places[identity][dataset.grid.poses_of(identity)] = np.arange(rows, rows + len(vertices))
             rows += len(vertices)
             meshes.append(torch.from_numpy(bounding_box(vertices).normalise(vertices).astype(np.float32)))
         self._meshes = torch.cat(meshes).to(device)
@@ -80,7 +80,8 @@ class VertexBank:
 
     def gather(self, identities: NDArray[np.integer], poses: NDArray[np.integer]) -> Tensor:
         """Normalised vertices [batch, vertex, 3] of the cells (identity, pose)."""
-        rows = np.array([self._first[int(identity)] for identity in identities]) + poses
+        cells = zip(identities, poses, strict=True)
+        rows = np.array([self._places[int(identity)][pose] for identity, pose in cells])
         return self._meshes[torch.from_numpy(rows).to(self._meshes.device)]
 
     def batch(self, triples: NDArray[np.integer]) -> Batch:
@@ -108,20 +109,26 @@ def epoch_triples(*, identities: int, poses: int, seed: int, epoch: int) -> NDAr
 
 @dataclass(frozen=True)
 class TripleOrder:
-    """The order of training triples over a whole run, the same for any number of ranks."""
+    """The order of training triples of some identities and poses over a whole run, the same for any number of ranks."""
 
     identities: Sequence[int]
-    poses: int
+    poses: Sequence[int] | NDArray[np.integer]
     batch: int
     seed: int
 
     def __post_init__(self) -> None:
+        if len(self.identities) < 2 or len(self.poses) < 2:
+            raise DatasetError(
+                f"a training triple needs two identities and two poses, but the training split has "
+                f"{len(self.identities)} identities in {len(self.poses)} poses. Make a larger one: "
+                "--set data.identities.training=... data.poses.seen=..."
+            )
         if self.steps_per_epoch == 0:
             raise DatasetError(f"the training grid has {self.cells} cells, fewer than a batch of {self.batch}")
 
     @property
     def cells(self) -> int:
-        return len(self.identities) * self.poses
+        return len(self.identities) * len(self.poses)
 
     @property
     def steps_per_epoch(self) -> int:
@@ -129,13 +136,14 @@ class TripleOrder:
 
     def batches(self, *, first_step: int, rank: int = 0, ranks: int = 1) -> Iterator[NDArray[np.int64]]:
         """This rank's share of every batch from ``first_step`` on, without end."""
-        numbers = np.asarray(self.identities)
+        numbers, poses = np.asarray(self.identities), np.asarray(self.poses)
         share = self.batch // ranks
         step = first_step
         while True:
             epoch = step // self.steps_per_epoch
-            triples = epoch_triples(identities=len(numbers), poses=self.poses, seed=self.seed, epoch=epoch)
+            triples = epoch_triples(identities=len(numbers), poses=len(poses), seed=self.seed, epoch=epoch)
             triples[:, [0, 2]] = numbers[triples[:, [0, 2]]]
+            triples[:, [1, 3]] = poses[triples[:, [1, 3]]]
             for place in range(step % self.steps_per_epoch, self.steps_per_epoch):
                 start = place * self.batch + rank * share
                 yield triples[start : start + share]

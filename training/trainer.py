@@ -83,7 +83,7 @@ class _Trainer:
         self.device, self._stop, self.stopping = device, stop, False
         self.bank = VertexBank(dataset, dataset.identities("training"), device=self.device)
         self.order = TripleOrder(
-            dataset.identities("training"), dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed
+            dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed
         )
         self.last_step = recipe.steps or recipe.epochs * self.order.steps_per_epoch
         torch.manual_seed(recipe.seed)

@@ -163,7 +163,7 @@ def start_over(out: Path) -> None:
     RecipeError
         The folder does not look like a workflow's.
     """
-    from datagen.generate import remove
+    from datagen.places import remove
 
     strangers = {path.name for path in out.iterdir()} - {".lock", "mlflow.db", "mlartifacts", *_OWN}
     if strangers and not (out / "recipe.yaml").exists():

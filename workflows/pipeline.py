@@ -157,7 +157,7 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> No
 def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
     """The step at which a training of this recipe on this dataset ends."""
     identities = dataset.identities("training")
-    order = TripleOrder(identities, dataset.recipe.poses.seen, recipe.batch, seed=recipe.seed)
+    order = TripleOrder(identities, dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
     return recipe.steps or recipe.epochs * order.steps_per_epoch
 
 
@@ -228,12 +228,12 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 
 def _title(dataset: Dataset) -> str:
     recipe = dataset.recipe
-    count = dataset.vertices(0, 0).shape[0]
+    count = dataset.vertex_count(0)
     return f"Pose transfer on {recipe.body.family} bodies of {count:,} vertices"
 
 
 def _emd_points(recipe: EvaluationRecipe, dataset: Dataset) -> int:
-    return min(recipe.emd_points, dataset.vertices(0, 0).shape[0])
+    return min(recipe.emd_points, dataset.vertex_count(0))
 
 
 def _write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:

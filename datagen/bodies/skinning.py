@@ -56,7 +56,7 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     rest
         The identity.
     world
-        Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes (see :meth:`datagen.poses.Poses.on`).
+        Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes (:meth:`datagen.poses.Poses.on`).
     correctives
         Displacements [pose, vertex, 3] of the rest vertices in metres, such as SMPL's pose blend shapes.
     """

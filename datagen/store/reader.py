@@ -1,6 +1,6 @@
 """Reading a dataset: only a complete and sound one; anything else is an error that names the mending command."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,21 +8,29 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.abc.store import ByteRequest, RangeByteRequest, SuffixByteRequest
 
 from datagen.errors import DatasetError
 from datagen.grid import Grid, PoseType, Split
+from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
+from datagen.store.codec import ShardCodec, ShardDamage
 from datagen.store.schema import (
     ManifestRow,
     array_at,
     attributes_of,
     check_version,
+    codec_of,
     identity_name,
     open_group,
+    read_bytes,
     stored_recipe,
     stored_sizes,
     vertices_path,
 )
+
+Meshes = NDArray[np.float32]
+_WHOLE_FROM = 4  # a shard is read whole where at least a quarter of it is wanted
 
 
 @dataclass(frozen=True)
@@ -59,44 +67,87 @@ class Dataset:
 
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
-        return [i for i in range(self.grid.identity_count) if self.grid.split(i) == split]
+        return self.grid.identities(split)
 
     def faces(self, identity: int) -> NDArray[np.int32]:
         """Triangles [face, 3] of an identity."""
         topology = self.group[f"identity/{identity_name(identity)}"].attrs["topology"]
-        return np.asarray(array_at(self.group, f"topology/{topology}/faces")[:])
+        return self._small(f"topology/{topology}/faces")
 
     def parameters(self, identity: int) -> NDArray[np.float64]:
         """Body-model parameters [parameter] of an identity."""
-        return np.asarray(array_at(self.group, f"identity/{identity_name(identity)}/parameters")[:])
+        return self._small(f"identity/{identity_name(identity)}/parameters")
 
-    def vertices(self, identity: int, rows: slice | int = slice(None)) -> NDArray[np.float32]:
-        """Vertices [row, vertex, 3] (or [vertex, 3] for one row) in metres; row r is pose ``grid.poses_of(i)[r]``.
+    def poses(self) -> Poses:
+        """The poses of the whole dataset, over its named joints."""
+        joints, parents = self.attributes["joints"], self.attributes["joint_parents"]
+        return Poses(tuple(joints), tuple(parents), self._small("pose/parameters"))
+
+    def vertex_count(self, identity: int) -> int:
+        """Vertices of an identity's meshes."""
+        return int(array_at(self.group, vertices_path(identity)).shape[1])
+
+    def vertices(self, identity: int, poses: int | Sequence[int] | NDArray[np.integer] | None = None) -> Meshes:
+        """Vertices [pose, vertex, 3] float32 in metres of an identity in some poses; [vertex, 3] for one number.
+
+        Without ``poses`` in all of its own, in the order of ``grid.poses_of(identity)``.
 
         Raises
         ------
         DatasetError
             A shard is missing or damaged; the message names it and the command that mends it.
+        KeyError
+            The identity was not made in such a pose.
         """
-        path = vertices_path(identity)
+        if isinstance(poses, (int, np.integer)):
+            return self.vertices(identity, [int(poses)])[0]
+        wanted = self.grid.poses_of(identity) if poses is None else poses
+        rows = np.array([self.grid.row_of(identity, int(pose)) for pose in wanted], np.int64)
+        codec = codec_of(self.recipe, self.grid.split(identity), vertices=self.vertex_count(identity))
+        meshes = np.empty((len(rows), codec.vertices, 3), np.float32)
+        for number in np.unique(rows // codec.rows):
+            places = np.flatnonzero(rows // codec.rows == number)
+            path = f"{vertices_path(identity)}/c/{number}/0/0"
+            meshes[places] = self._from_shard(path, codec, rows[places] % codec.rows)
+        return meshes
+
+    def _from_shard(self, path: str, codec: ShardCodec, rows: NDArray[np.int64]) -> Meshes:
         try:
-            vertices = np.asarray(array_at(self.group, path)[rows])
-        except (RuntimeError, ValueError, OSError) as error:
-            raise DatasetError(f"{self._shards(path)} damaged ({error}). {self._mend}") from error
-        if not np.isfinite(vertices).all():  # a missing shard reads as the fill value, NaN
-            raise DatasetError(f"{self._shards(path)} missing (fill values were read). {self._mend}")
-        return vertices
+            if len(rows) * _WHOLE_FROM >= codec.rows:
+                return codec.decode(self._bytes(path), int(rows.max()) + 1)[rows]
+            return self._single_meshes(path, codec, rows)
+        except ShardDamage as error:
+            raise DatasetError(f"{self.url}: shard {path} is damaged: {error}. {self._mend}") from error
+
+    def _single_meshes(self, path: str, codec: ShardCodec, rows: NDArray[np.int64]) -> Meshes:
+        index = codec.decode_index(self._bytes(path, SuffixByteRequest(codec.index_bytes)))
+        meshes = np.empty((len(rows), codec.vertices, 3), np.float32)
+        for mesh, (offset, size) in zip(meshes, codec.places(index, rows.tolist()), strict=True):
+            codec.decode_mesh(self._bytes(path, RangeByteRequest(offset, offset + size)), mesh)
+        return meshes
+
+    def _bytes(self, path: str, byte_range: ByteRequest | None = None) -> bytes:
+        try:
+            found = read_bytes(self.group, path, byte_range=byte_range)
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{self.url}: shard {path} cannot be read ({error}). {self._mend}") from error
+        if found is None:
+            raise DatasetError(f"{self.url}: shard {path} is missing. {self._mend}")
+        return found
+
+    def _small(self, path: str) -> NDArray[Any]:
+        try:
+            return np.asarray(array_at(self.group, path)[...])
+        except (KeyError, RuntimeError, ValueError, OSError) as error:
+            raise DatasetError(f"{self.url}: {path} is missing or damaged ({error}). {self._mend}") from error
 
     def evaluation_triples(self, pose_type: PoseType) -> NDArray[np.int32]:
         """Rows of (source identity, source pose, target identity, target pose); truth = (target, source pose)."""
-        return np.asarray(array_at(self.group, f"evaluation/{pose_type}")[:])
+        return self._small(f"evaluation/{pose_type}")
 
     @property
     def _mend(self) -> str:
         return f"Mend it: dsffnet verify {self.url} --repair"
-
-    def _shards(self, path: str) -> str:
-        return f"{self.url}: a shard of {path} is"
 
 
 def read_manifest(group: zarr.Group) -> list[ManifestRow]:

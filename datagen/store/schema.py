@@ -3,7 +3,7 @@
 NAME.zarr                     status building|complete, recipe, splits, provenance, statistics (attributes)
   topology/T/faces            (face, 3) int32
   identity/I/vertices         (row, vertex, 3) float32, metres, Y up; chunk = one mesh, shard = many rows
-  identity/I/pose             (row,) int32, the pose number of each row
+  identity/I/pose             (row,) int32, the pose number of each row; -1: the row holds no mesh
   identity/I/parameters       (parameter,) float64, what the body model needs to make this identity again
   pose/parameters             (pose, joint, 3) float64, axis-angle in radians
   evaluation/seen, /unseen    (triple, 4) int32: source identity, source pose, target identity, target pose
@@ -17,15 +17,21 @@ from typing import Any
 import numpy as np
 import zarr
 from pydantic import ValidationError
+from zarr.abc.store import ByteRequest
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
 from datagen.errors import DatasetError
-from datagen.grid import Shard
+from datagen.grid import Grid, Shard, Split
 from datagen.recipe import DatasetRecipe
+from datagen.store.codec import ShardCodec
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+
+
+class NoDataset(DatasetError):
+    """There is nothing at that place."""
 
 
 @dataclass(frozen=True, order=True)
@@ -62,25 +68,30 @@ def shard_path(shard: Shard) -> str:
     return f"{vertices_path(shard.identity)}/c/{shard.number}/0/0"
 
 
-def create_vertices_array(group: zarr.Group, path: str, *, rows: int, vertices: int, shard: int, level: int) -> None:
-    """An empty array (row, vertex, 3): NaN fill, one mesh a chunk, Blosc-zstd-shuffle then crc32c inside each shard."""
-    chunk = (1, vertices, 3)
-    codec = ShardingCodec(
-        chunk_shape=chunk,
-        codecs=[BytesCodec(), BloscCodec(cname="zstd", clevel=level, shuffle="shuffle", typesize=4), Crc32cCodec()],
-        index_codecs=[BytesCodec(), Crc32cCodec()],
-    )
+def create_vertices_array(group: zarr.Group, path: str, *, rows: int, codec: ShardCodec) -> None:
+    """An empty array (row, vertex, 3): NaN fill, one mesh a chunk, Blosc with shuffle, crc32c inside each shard."""
+    blosc = BloscCodec(cname=codec.compressor, clevel=codec.level, shuffle="shuffle", typesize=4)
     group.create_array(
         path,
-        shape=(rows, vertices, 3),
+        shape=(rows, codec.vertices, 3),
         dtype="float32",
-        chunks=(min(shard, rows), vertices, 3),
-        serializer=codec,
+        chunks=(codec.rows, codec.vertices, 3),
+        serializer=ShardingCodec(
+            chunk_shape=(1, codec.vertices, 3),
+            codecs=[BytesCodec(), blosc, Crc32cCodec()],
+            index_codecs=[BytesCodec(), Crc32cCodec()],
+        ),
         compressors=None,
         filters=None,
         fill_value=np.nan,
         dimension_names=("row", "vertex", "coordinate"),
     )
+
+
+def codec_of(recipe: DatasetRecipe, split: Split, *, vertices: int) -> ShardCodec:
+    """How an identity's shards are laid out."""
+    store = recipe.store
+    return ShardCodec(Grid(recipe).rows_per_shard(split), vertices, store.codec, store.compression_level)
 
 
 def array_at(group: zarr.Group, path: str) -> zarr.Array[Any]:
@@ -116,15 +127,15 @@ def stored_recipe(url: str, group: zarr.Group) -> DatasetRecipe:
         ) from error
 
 
-def read_bytes(group: zarr.Group, path: str) -> bytes | None:
-    """Raw bytes of one object of the dataset's store, or None where there is none."""
-    found = sync(group.store.get(_key(group, path), default_buffer_prototype()))
+def read_bytes(group: zarr.Group, path: str, *, byte_range: ByteRequest | None = None) -> bytes | None:
+    """Bytes of one object of the dataset's store, all or a range of them; None where there is none."""
+    found = sync(group.store.get(_key(group, path), default_buffer_prototype(), byte_range))
     return None if found is None else found.to_bytes()
 
 
-def delete_object(group: zarr.Group, path: str) -> None:
-    """Remove one object of the dataset's store, if it is there."""
-    sync(group.store.delete(_key(group, path)))
+def write_bytes(group: zarr.Group, path: str, content: bytes) -> None:
+    """Write one object of the dataset's store whole, in the place of any that is there."""
+    sync(group.store.set(_key(group, path), default_buffer_prototype().buffer.from_bytes(content)))
 
 
 def _key(group: zarr.Group, path: str) -> str:
@@ -157,9 +168,7 @@ def open_group(url: str, *, mode: str = "r") -> zarr.Group:
     try:
         return zarr.open_group(url, mode=mode, zarr_format=3)  # type: ignore[arg-type]
     except FileNotFoundError as error:
-        raise DatasetError(
-            f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}"
-        ) from error
+        raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
     except (ValueError, KeyError, OSError) as error:
@@ -168,13 +177,18 @@ def open_group(url: str, *, mode: str = "r") -> zarr.Group:
         ) from error
 
 
+def check_ours(url: str, group: zarr.Group) -> None:
+    """Refuse a Zarr group that is not a dataset of this project."""
+    if "format_version" not in group.attrs:
+        raise DatasetError(f"{url} is a Zarr group but not a dataset of this project (no format_version attribute)")
+
+
 def check_version(url: str, group: zarr.Group) -> None:
     """Refuse what this version cannot read, in both directions, saying what to do."""
-    found = attributes_of(group).get("format_version")
+    check_ours(url, group)
+    found = attributes_of(group)["format_version"]
     if found == FORMAT_VERSION:
         return
-    if found is None:
-        raise DatasetError(f"{url} is a Zarr group but not a dataset of this project (no format_version attribute)")
     newer = isinstance(found, int) and found > FORMAT_VERSION
     advice = "update the project" if newer else "make it again: dsffnet generate --recipe RECIPE --out NEW.zarr"
     raise DatasetError(f"{url} has format version {found!r}, this program reads {FORMAT_VERSION}; {advice}")

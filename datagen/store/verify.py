@@ -44,7 +44,7 @@ def find_faults(url: str, *, progress: Progress = iter) -> Iterator[Fault]:
     grid = Grid(require_recipe(url))
     manifest = {row.path: row for row in read_manifest(group)}
     for shard in progress(grid.shards()):
-        reason = _fault(url, shard, read_bytes(group, shard_path(shard)), manifest.get(shard_path(shard)))
+        reason = _fault(url, grid.recipe, shard, read_bytes(group, shard_path(shard)), manifest.get(shard_path(shard)))
         if reason:
             yield Fault(shard_path(shard), reason, shard)
     yield from _small_faults(group, grid)
@@ -65,15 +65,15 @@ def _small_faults(group: zarr.Group, grid: Grid) -> Iterator[Fault]:
             yield Fault(path, f"cannot be read ({error})")
 
 
-def _fault(url: str, shard: Shard, raw: bytes | None, row: ManifestRow | None) -> str | None:
+def _fault(url: str, recipe: DatasetRecipe, shard: Shard, raw: bytes | None, row: ManifestRow | None) -> str | None:
     if raw is None:
         return "missing"
     if row is not None and len(raw) != row.bytes:
         return f"{len(raw)} bytes instead of {row.bytes}"
     if row is not None and hashlib.sha256(raw).hexdigest() != row.sha256:
         return "its sha256 is not the manifest's"
-    if existing_shard(url, shard) is None:
-        return "cannot be decoded, or holds values that are not finite"
+    if existing_shard(url, recipe, shard) is None:
+        return "cannot be decoded"
     return None
 
 

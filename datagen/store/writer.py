@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numcodecs.blosc
 import numpy as np
 import zarr
 from numpy.typing import NDArray
@@ -21,31 +20,31 @@ from zarr.codecs import ZstdCodec
 
 from datagen.bodies import BodyModel
 from datagen.errors import DatasetError, StorageError
-from datagen.grid import Grid, Shard
-from datagen.poses import JOINTS, draw_poses
+from datagen.grid import POSE_TYPES, Grid, Shard
+from datagen.poses import draw_poses, load_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
+from datagen.store.codec import ShardDamage
 from datagen.store.schema import (
     FORMAT_VERSION,
     ManifestRow,
     array_at,
     attributes_of,
     check_version,
+    codec_of,
     create_vertices_array,
-    delete_object,
     identity_name,
     open_group,
     read_bytes,
     shard_path,
     stored_recipe,
+    stored_sizes,
     vertices_path,
+    write_bytes,
 )
 
-# Blosc's threads write their blocks in the order in which they finish; one thread makes the bytes reproducible.
-numcodecs.blosc.use_threads = False
-
 _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
-_PACKAGES = ("anny", "numpy", "scipy", "zarr", "numcodecs")
+_PACKAGES = ("anny", "smplx", "numpy", "scipy", "zarr", "numcodecs")
 
 
 def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
@@ -59,48 +58,56 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
     Raises
     ------
     DatasetError
-        A dataset of another recipe or version is there already.
+        A dataset of another recipe, other assets or another version is there already.
     """
     with _writing(url):
         group = open_group(url, mode="a")
         if "format_version" in group.attrs:
             check_same_recipe(url, group, recipe)
-            _check_same_assets(url, group, body)
+            _check_same_assets(url, group, _assets(recipe, body))
         else:
             group.attrs.update(_attributes(recipe, body))
         _create_arrays(group, recipe, body)
 
 
-def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
-    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
+def grow(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
+    """Give a complete dataset a recipe that has grown: from here on it is a dataset in the making."""
     with _writing(url):
         group = open_group(url, mode="r+")
-        if read_bytes(group, shard_path(shard)) is not None and existing_shard(url, shard) is None:
-            delete_object(group, shard_path(shard))  # zarr would read it first, where a shard reaches past the array
-        array = array_at(group, vertices_path(shard.identity))
-        array[shard.start : shard.stop] = vertices
-    row = existing_shard(url, shard)
-    if row is None:
-        raise DatasetError(f"{url}: shard {shard_path(shard)} did not read back as it was written; is the disk sound?")
-    return row
+        _check_same_assets(url, group, _assets(recipe, body))
+        group.attrs.update(_attributes(recipe, body))
 
 
-def existing_shard(url: str, shard: Shard) -> ManifestRow | None:
+def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
+    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
+    codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=vertices.shape[1])
+    content, path = codec.encode(vertices), shard_path(shard)
+    with _writing(url):
+        group = open_group(url, mode="r+")
+        write_bytes(group, path, content)
+        if stored_sizes(group, [path]) != {path: len(content)}:
+            raise DatasetError(f"{url}: shard {path} is not there as it was written; is the storage sound?")
+    return _row(shard, content, vertices)
+
+
+def existing_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:
     """The manifest row of a shard that is there, whole and sound; None where it is missing or damaged."""
     group = open_group(url)
-    raw = read_bytes(group, shard_path(shard))
-    if raw is None:
+    content = read_bytes(group, shard_path(shard))
+    if content is None:
         return None
+    count = array_at(group, vertices_path(shard.identity)).shape[1]
     try:
-        vertices = np.asarray(array_at(group, vertices_path(shard.identity))[shard.start : shard.stop])
-    except (RuntimeError, ValueError, OSError):  # checksum, codec or index errors of a damaged shard
+        codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=count)
+        return _row(shard, content, codec.decode(content, shard.rows))
+    except ShardDamage:
         return None
-    if not np.isfinite(vertices).all():
-        return None
+
+
+def _row(shard: Shard, content: bytes, vertices: NDArray[np.float32]) -> ManifestRow:
     low, high = (bound(vertices, axis=(0, 1)).astype(float).tolist() for bound in (np.min, np.max))
-    return ManifestRow(
-        shard_path(shard), shard.rows, hashlib.sha256(raw).hexdigest(), len(raw), tuple(low), tuple(high)
-    )
+    digest = hashlib.sha256(content).hexdigest()
+    return ManifestRow(shard_path(shard), shard.rows, digest, len(content), tuple(low), tuple(high))
 
 
 def finish(url: str, rows: Sequence[ManifestRow]) -> None:
@@ -121,7 +128,7 @@ def finish(url: str, rows: Sequence[ManifestRow]) -> None:
 
 def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
     grid, digest = Grid(recipe), recipe.sha256()
-    assets = [vars(asset) for asset in body.assets]
+    assets, poses = _assets(recipe, body), load_poses(recipe.poses)
     return {
         "format_version": FORMAT_VERSION,
         "uuid": str(uuid.uuid5(_NAMESPACE, f"{FORMAT_VERSION} {digest} {assets}")),
@@ -132,18 +139,31 @@ def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
         "provenance": {"packages": _versions(), "git_commit": _git_commit()},
         "units": "metres",
         "frame": "Y up, facing +Z, +X to the body's left",
-        "joints": list(JOINTS),
+        "joints": list(poses.joints),
+        "joint_parents": list(poses.parents),
         "splits": {
             "identities": {identity_name(i): grid.split(i) for i in range(grid.identity_count)},
-            "poses": {"seen": [0, recipe.poses.seen], "unseen": [recipe.poses.seen, grid.pose_count]},
+            "poses": {kind: _spans(grid.poses(kind)) for kind in POSE_TYPES},
         },
     }
 
 
+def _assets(recipe: DatasetRecipe, body: BodyModel) -> list[dict[str, str]]:
+    """What the bytes depend on beside the recipe: the body's files and packages, and the poses'."""
+    return [vars(asset) for asset in dict.fromkeys([*body.assets, *load_poses(recipe.poses).assets])]
+
+
+def _spans(numbers: NDArray[np.int64]) -> list[list[int]]:
+    """Numbers as a few ranges [first, end)."""
+    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+    return [[int(run[0]), int(run[-1]) + 1] for run in np.split(numbers, breaks) if len(run)]
+
+
 def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
     grid = Grid(recipe)
-    _put(group, "pose/parameters", draw_poses(recipe.poses, range(grid.pose_count)), ("pose", "joint", "axis"))
-    for pose_type in ("seen", "unseen"):
+    poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
+    _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
+    for pose_type in POSE_TYPES:
         _put(group, f"evaluation/{pose_type}", grid.evaluation_triples(pose_type), ("triple", "column"))
     topologies: dict[bytes, str] = {}
     for identity in range(grid.identity_count):
@@ -157,19 +177,14 @@ def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) ->
 def _create_identity(
     group: zarr.Group, grid: Grid, identity: int, parameters: NDArray[np.float64], vertices: int, topology: str
 ) -> None:
-    home, poses = f"identity/{identity_name(identity)}", grid.poses_of(identity)
+    home, rows, path = f"identity/{identity_name(identity)}", grid.rows_of(identity), vertices_path(identity)
     _put(group, f"{home}/parameters", parameters, ("parameter",))
-    _put(group, f"{home}/pose", np.arange(poses.start, poses.stop, dtype=np.int32), ("row",))
-    if vertices_path(identity) not in group:
-        store = grid.recipe.store
-        create_vertices_array(
-            group,
-            vertices_path(identity),
-            rows=len(poses),
-            vertices=vertices,
-            shard=store.poses_per_shard,
-            level=store.compression_level,
-        )
+    _put(group, f"{home}/pose", rows.astype(np.int32), ("row",))
+    if path not in group:
+        codec = codec_of(grid.recipe, grid.split(identity), vertices=vertices)
+        create_vertices_array(group, path, rows=len(rows), codec=codec)
+    elif array_at(group, path).shape[0] != len(rows):
+        array_at(group, path).resize((len(rows), vertices, 3))
     group.require_group(home).attrs.update({"topology": topology, "split": grid.split(identity)})
 
 
@@ -196,17 +211,19 @@ def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
         return False
 
 
-def _check_same_assets(url: str, group: zarr.Group, body: BodyModel) -> None:
-    stored, present = attributes_of(group)["body"]["assets"], [vars(asset) for asset in body.assets]
-    if stored != present:
-        raise DatasetError(
-            f"{url} was made from {_named(stored)}, but {_named(present)} is installed. Install that version, or "
-            "write to another place, or add --fresh to make it anew"
-        )
+def _check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:
+    stored = attributes_of(group)["body"]["assets"]
+    if stored == present:
+        return
+    changed = [asset for asset in stored if asset not in present] or stored
+    raise DatasetError(
+        f"{url} was made from {_named(changed)}, but here is {_named([a for a in present if a not in stored])}. "
+        "Use what it was made from, or write to another place, or add --fresh to make it anew"
+    )
 
 
 def _named(assets: Sequence[dict[str, Any]]) -> str:
-    return ", ".join(f"{asset['name']} {asset['version']}" for asset in assets)
+    return ", ".join(f"{asset['name']} {asset['version']}" for asset in assets) or "nothing of the kind"
 
 
 def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
@@ -216,7 +233,7 @@ def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> Non
     if attributes["recipe_sha256"] == recipe.sha256():
         return
     stored = stored_recipe(url, group)
-    changed = ", ".join(_differences(stored.model_dump(mode="json"), recipe.model_dump(mode="json")))
+    changed = ", ".join(_differences(stored.identifying(), recipe.identifying()))
     raise DatasetError(
         f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"
     )

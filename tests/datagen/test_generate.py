@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from datagen import generate as generation
 from datagen.errors import BodyError, DatasetError
-from datagen.generate import generate, inline, make_shard, prepare, writing_alone
+from datagen.generate import generate, inline, make_shard, prepare
 from datagen.grid import Grid
+from datagen.places import writing_alone
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash

@@ -36,7 +36,7 @@ def test_what_is_read_is_what_was_made(dataset: str) -> None:
     grid, recipe = opened.grid, opened.recipe
     assert recipe == tiny_dataset()
     for shard in grid.shards():
-        vertices = opened.vertices(shard.identity, slice(shard.start, shard.stop))
+        vertices = opened.vertices(shard.identity, grid.rows_of(shard.identity)[shard.start : shard.stop])
         assert np.array_equal(vertices, make_shard(recipe, shard))
     assert np.array_equal(opened.vertices(4, 9), opened.vertices(4)[9])
     assert np.array_equal(opened.evaluation_triples("unseen"), grid.evaluation_triples("unseen"))
@@ -64,7 +64,7 @@ def test_accidental_shard_delete(spoilable: Path) -> None:
     first_shard(spoilable).unlink()
     with pytest.raises(DatasetError, match=r"shard identity/0000/vertices/c/0/0/0 is missing.*verify .* --repair"):
         open_dataset(str(spoilable))
-    with pytest.raises(DatasetError, match="identity/0000/vertices is missing"):
+    with pytest.raises(DatasetError, match="identity/0000/vertices/c/0/0/0 is missing"):
         opened.vertices(0)
 
 
@@ -78,7 +78,7 @@ def test_truncated_shard(spoilable: Path) -> None:
 def test_bit_flip_in_a_shard_is_an_error_and_never_wrong_data(spoilable: Path, at: float) -> None:
     flip_bit(first_shard(spoilable), at=at)
     opened = open_dataset(str(spoilable))
-    with pytest.raises(DatasetError, match=r"identity/0000/vertices is damaged.*--repair"):
+    with pytest.raises(DatasetError, match=r"identity/0000/vertices/c/0/0/0 is damaged.*--repair"):
         opened.vertices(0)
     assert [fault.path for fault in find_faults(str(spoilable))] == ["identity/0000/vertices/c/0/0/0"]
 
@@ -132,7 +132,7 @@ def test_metadata_that_is_not_json(spoilable: Path) -> None:
 
 def test_format_version_from_the_future(spoilable: Path) -> None:
     open_group(str(spoilable), mode="r+").attrs["format_version"] = 99
-    with pytest.raises(DatasetError, match="format version 99, this program reads 1; update"):
+    with pytest.raises(DatasetError, match="format version 99, this program reads 2; update"):
         open_dataset(str(spoilable))
 
 
@@ -225,10 +225,10 @@ def test_repair_refuses_to_commit_other_bytes(spoilable: Path, monkeypatch: pyte
 
 
 def test_other_assets_are_refused_when_going_on(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from datagen.bodies import Asset
+    from datagen.assets import Asset
     from datagen.bodies.leg import LegModel
 
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
     monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "2"),))
-    with pytest.raises(DatasetError, match="was made from procedural leg 1, but procedural leg 2 is installed"):
+    with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg 2"):
         generate(tiny_dataset(), str(spoilable))

@@ -1,0 +1,100 @@
+"""One shard file, encoded and decoded whole or mesh by mesh: Zarr v3's sharding codec for our one kind of array.
+
+Layout (Zarr v3, `sharding_indexed`): one chunk a mesh, each Blosc-compressed with byte shuffle and followed by its
+crc32c; then the index, (offset, bytes) as little-endian uint64 for every row the shard has room for, all ones where a
+row holds nothing; then the index' crc32c. Zarr reads and writes the same bytes (tested); it takes about a
+quarter of a millisecond a mesh for it, this a few microseconds.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import google_crc32c
+import numcodecs.blosc
+import numpy as np
+from numcodecs import Blosc
+from numpy.typing import NDArray
+
+# Blosc's threads write their blocks in the order in which they finish; one thread makes the bytes reproducible.
+numcodecs.blosc.use_threads = False
+
+_NOTHING = 2**64 - 1
+_CHECKSUM = struct.Struct("<I")
+
+
+class ShardDamage(ValueError):
+    """The bytes of a shard are not what was written."""
+
+
+@dataclass(frozen=True)
+class ShardCodec:
+    """How the shards of one array are laid out: room for ``rows`` meshes of ``vertices`` vertices each."""
+
+    rows: int
+    vertices: int
+    compressor: Literal["lz4", "zstd"]
+    level: int
+
+    @property
+    def index_bytes(self) -> int:
+        """Size of the index at the end of the file, its checksum included."""
+        return 16 * self.rows + _CHECKSUM.size
+
+    def encode(self, meshes: NDArray[np.float32]) -> bytes:
+        """The file that holds meshes [row, vertex, 3]; fewer than ``rows`` leave the last ones empty."""
+        compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
+        chunks = [_sealed(bytes(compressor.encode(mesh))) for mesh in np.ascontiguousarray(meshes, "<f4")]
+        sizes = np.array([len(chunk) for chunk in chunks], np.uint64)
+        index = np.full((self.rows, 2), _NOTHING, "<u8")
+        index[: len(chunks), 0] = np.cumsum(sizes) - sizes
+        index[: len(chunks), 1] = sizes
+        return b"".join([*chunks, _sealed(index.tobytes())])
+
+    def decode(self, file: bytes, rows: int) -> NDArray[np.float32]:
+        """The first ``rows`` meshes [row, vertex, 3] of a file.
+
+        Raises
+        ------
+        ShardDamage
+            Cut short, a checksum that does not fit, or a mesh that is not there.
+        """
+        index = self.decode_index(file[-self.index_bytes :])
+        meshes, view = np.empty((rows, self.vertices, 3), np.float32), memoryview(file)
+        for mesh, (offset, size) in zip(meshes, self.places(index, range(rows)), strict=True):
+            self.decode_mesh(view[offset : offset + size], mesh)
+        return meshes
+
+    def decode_index(self, tail: bytes) -> NDArray[np.uint64]:
+        """(offset, bytes) of every row [row, 2], from the last ``index_bytes`` of a file."""
+        if len(tail) != self.index_bytes:
+            raise ShardDamage(f"its index has {len(tail)} bytes instead of {self.index_bytes}")
+        return np.frombuffer(_unsealed(tail, "its index"), "<u8").reshape(self.rows, 2)
+
+    def places(self, index: NDArray[np.uint64], rows: range | list[int]) -> Iterator[tuple[int, int]]:
+        """Offset and size of the chunk of each of these rows."""
+        for row in rows:
+            offset, size = map(int, index[row])
+            if offset == _NOTHING:
+                raise ShardDamage(f"its row {row} is empty")
+            yield offset, size
+
+    def decode_mesh(self, chunk: bytes | memoryview, out: NDArray[np.float32]) -> None:
+        """Decode one chunk into ``out`` [vertex, 3]."""
+        content = _unsealed(chunk, "a mesh")
+        try:
+            numcodecs.blosc.decompress(content, out)
+        except (RuntimeError, ValueError) as error:
+            raise ShardDamage(f"a mesh cannot be decompressed ({error})") from error
+
+
+def _sealed(content: bytes) -> bytes:
+    return content + _CHECKSUM.pack(google_crc32c.value(content))
+
+
+def _unsealed(content: bytes | memoryview, what: str) -> bytes:
+    body = bytes(content[: -_CHECKSUM.size])
+    if len(content) <= _CHECKSUM.size or _CHECKSUM.unpack(content[-_CHECKSUM.size :])[0] != google_crc32c.value(body):
+        raise ShardDamage(f"the crc32c of {what} does not fit")
+    return body
