@@ -74,7 +74,12 @@ def parser(text: str) -> argparse.ArgumentParser:
 def add_recipe_options(made: argparse.ArgumentParser) -> None:
     """--recipe and --set."""
     names = ", ".join(known_recipes())
-    made.add_argument("--recipe", default="quickstart", metavar="NAME|FILE", help=f"a YAML file, or one of {names}")
+    made.add_argument(
+        "--recipe",
+        default="quickstart",
+        metavar="NAME|FILE|X.zarr",
+        help=f"a YAML file, or the recipe that a dataset was made by, or one of {names}",
+    )
     made.add_argument(
         "--set",
         action="extend",

@@ -1,13 +1,16 @@
 """The recipe of a whole workflow: its sections, reading it from YAML, overrides, and errors a person can act on."""
 
 import difflib
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 
+from datagen.bodies import FAMILIES
 from datagen.errors import RecipeError
+from datagen.poses import SOURCES
 from datagen.recipe import DatasetRecipe, Frozen
 from training.recipe import EvaluationRecipe, TrainingRecipe
 
@@ -45,10 +48,15 @@ def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRec
         if "=" not in override:
             raise RecipeError(f"--set {override!r} is not of the form section.key=value, e.g. --set training.steps=100")
     try:
-        merged = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(list(overrides)))
-        values = OmegaConf.to_container(merged, resolve=True)
+        base = OmegaConf.load(path) if isinstance(path, Path) else OmegaConf.create(path)
+        changes = OmegaConf.from_dotlist(list(overrides))
+        for section, kind in _KINDS:
+            chosen = OmegaConf.select(changes, f"{section}.{kind}")
+            if chosen is not None and chosen != OmegaConf.select(base, f"{section}.{kind}"):
+                OmegaConf.update(base, section, {}, merge=False)  # the keys of another kind would not fit it
+        values = OmegaConf.to_container(OmegaConf.merge(base, changes), resolve=True)
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
-        raise RecipeError(f"recipe {path} cannot be read: {_first_line(error)}") from error
+        raise RecipeError(f"recipe {name_or_file} cannot be read: {_first_line(error)}") from error
     return check_recipe(values, where=str(name_or_file))
 
 
@@ -81,18 +89,35 @@ def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
 def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -> Iterator[str]:
     """One line for each key of the recipe: dotted name, default, meaning."""
     for name, field in model.model_fields.items():
-        sections = [part for part in _parts(field.annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+        is_list = get_origin(field.annotation) is tuple
+        parts = [] if is_list else list(_parts(field.annotation))
+        sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
         for section in sections:
             yield from describe_fields(section, f"{prefix}{name}.")
         if not sections:
             default = field.get_default(call_default_factory=True)
-            yield f"  {prefix}{name} = {default}" + (f"    {field.description}" if field.description else "")
+            shown = (
+                [part.model_dump() for part in default]
+                if is_list and default and isinstance(default[0], BaseModel)
+                else default
+            )
+            words = textwrap.wrap(field.description or "", 100)
+            yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
 
 
-def _find(name_or_file: str) -> Path:
+_KINDS = (("data.body", "family"), ("data.poses.distribution", "name"))
+"""Sections of which there are several kinds, and the key that says which."""
+
+
+def _find(name_or_file: str) -> Path | dict[str, Any]:
+    """The file of a recipe, or the recipe that is stored with a dataset."""
     known = known_recipes()
     if name_or_file in known:
         return known[name_or_file]
+    if "://" in name_or_file or name_or_file.rstrip("/").endswith(".zarr"):
+        from datagen.store.verify import require_recipe
+
+        return {"data": require_recipe(name_or_file).model_dump(mode="json")}
     path = Path(name_or_file)
     if path.suffix in (".yaml", ".yml"):
         if path.is_file():
@@ -104,7 +129,8 @@ def _find(name_or_file: str) -> Path:
 def _describe(fault: Any) -> str:
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
-    key = ".".join(part for i, part in enumerate(location) if not (i and location[i - 1] == "body" and part in _BODIES))
+    parts = zip(["", *location], location, strict=False)
+    key = ".".join(part for before, part in parts if not (before in ("body", "distribution") and part in _MEMBERS))
     if fault["type"] == "extra_forbidden":
         return f"unknown key {key!r}{_nearest(key, [line.split()[0] for line in describe_fields()])}"
     return f"{key}: {fault['msg']} (given: {fault['input']!r})"
@@ -120,8 +146,6 @@ def _nearest(name: str, known: list[str]) -> str:
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
-    from typing import get_args
-
     members = get_args(annotation)
     if isinstance(annotation, type) or not members:
         yield annotation
@@ -130,4 +154,4 @@ def _parts(annotation: Any) -> Iterator[Any]:
             yield from _parts(member)
 
 
-_BODIES = {"anny", "leg"}
+_MEMBERS = {*FAMILIES, *SOURCES}

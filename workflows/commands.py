@@ -1,0 +1,34 @@
+"""How subcommands of ``dsffnet`` are declared: a function, its examples, its arguments."""
+
+import argparse
+from collections.abc import Callable
+
+from workflows.recipe import describe_fields
+
+Command = Callable[[argparse.Namespace], None]
+
+
+def add_command(
+    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
+    command: Command,
+    examples: str,
+    *,
+    takes_recipe: bool = False,
+) -> argparse.ArgumentParser:
+    """A subparser named after ``NAME_command`` and described by its docstring; with a recipe, all keys are listed."""
+    keys = "\n\nkeys for --set, with their defaults:\n" + "\n".join(describe_fields()) if takes_recipe else ""
+    made = commands.add_parser(
+        command.__name__.removesuffix("_command").replace("_", "-"),
+        help=(command.__doc__ or "").split("\n")[0],
+        description=command.__doc__,
+        epilog=f"examples:\n{examples}{keys}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    made.set_defaults(command=command)
+    return made
+
+
+def print_facts(facts: dict[str, str]) -> None:
+    """Two aligned columns."""
+    width = max(map(len, facts))
+    print("\n".join(f"{name:{width}}  {value}" for name, value in facts.items()))
