@@ -17,6 +17,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
+from zarr.errors import ContainsArrayError
 
 from datagen.bodies import BodyModel
 from datagen.errors import DatasetError, StorageError
@@ -66,7 +67,7 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
             check_same_recipe(url, group, recipe)
             _check_same_assets(url, group, _assets(recipe, body))
         else:
-            group.attrs.update(_attributes(recipe, body))
+            group.update_attributes(_attributes(recipe, body))
         _create_arrays(group, recipe, body)
 
 
@@ -75,7 +76,7 @@ def grow(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
     with _writing(url):
         group = open_group(url, mode="r+")
         _check_same_assets(url, group, _assets(recipe, body))
-        group.attrs.update(_attributes(recipe, body))
+        group.update_attributes(_attributes(recipe, body))
 
 
 def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
@@ -115,7 +116,7 @@ def finish(url: str, rows: Sequence[ManifestRow]) -> None:
     ordered = sorted(rows)
     with _writing(url):
         group = open_group(url, mode="r+")
-        group.require_group("manifest").attrs["shards"] = [row.as_json() for row in ordered]
+        group.require_group("manifest").update_attributes({"shards": [row.as_json() for row in ordered]})
         digest = hashlib.sha256("\n".join(row.sha256 for row in ordered).encode()).hexdigest()
         statistics = {
             "meshes": sum(row.rows for row in ordered),
@@ -123,7 +124,7 @@ def finish(url: str, rows: Sequence[ManifestRow]) -> None:
             "minimum": np.min([row.minimum for row in ordered], axis=0).tolist(),
             "maximum": np.max([row.maximum for row in ordered], axis=0).tolist(),
         }
-        group.attrs.update({"statistics": statistics, "manifest_sha256": digest, "status": "complete"})
+        group.update_attributes({"statistics": statistics, "manifest_sha256": digest, "status": "complete"})
 
 
 def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
@@ -182,10 +183,11 @@ def _create_identity(
     _put(group, f"{home}/pose", rows.astype(np.int32), ("row",))
     if path not in group:
         codec = codec_of(grid.recipe, grid.split(identity), vertices=vertices)
-        create_vertices_array(group, path, rows=len(rows), codec=codec)
+        with contextlib.suppress(ContainsArrayError):  # on a store without a lock, somebody else was first
+            create_vertices_array(group, path, rows=len(rows), codec=codec)
     elif array_at(group, path).shape[0] != len(rows):
         array_at(group, path).resize((len(rows), vertices, 3))
-    group.require_group(home).attrs.update({"topology": topology, "split": grid.split(identity)})
+    group.require_group(home).update_attributes({"topology": topology, "split": grid.split(identity)})
 
 
 def _put(group: zarr.Group, path: str, values: NDArray[Any], dimensions: tuple[str, ...]) -> None:
