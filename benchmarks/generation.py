@@ -1,45 +1,77 @@
-"""Making meshes: this project's way against the body model alone, and against the way of NPT's generator.
+"""Making meshes: this project end to end, against the body model alone, and against the way of NPT's generator.
 
-    python benchmarks/generation.py [topology]
+    python benchmarks/generation.py [topology ...]
 
-All in one process on one BLAS thread, the same identity and poses, medians of interleaved rounds. The NPT way (one mesh
-at a time: NumPy skinning of every vertex by its own 4x4 matrix, text OBJ) is written anew from its description.
+For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
+skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
+forward, this project's body alone, and whole shards (identity, pose, check, compress, checksum, hash, write). Then
+reading, size, a worker's memory, and one against two Ray workers.
 """
 
+import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
-from datagen.bodies.skinning import Rest, joint_transforms
-from datagen.generate import make_shard, prepare
-from datagen.grid import Grid
+from datagen.bodies.skinning import joint_transforms
+from datagen.generate import ensure_shard, prepare
+from datagen.grid import Grid, Shard
 from datagen.poses import draw_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
-from datagen.store.writer import write_shard
+from datagen.store.reader import Dataset
+from datagen.store.schema import open_group, shard_path
 
-POSES, ROUNDS, ONE_AT_A_TIME = 100, 5, 10
+POSES, IDENTITIES, ROUNDS, ONE_AT_A_TIME = 100, 7, 7, 10
 
 
-def one_at_a_time(rest: Rest, rotations: np.ndarray, faces: np.ndarray, folder: Path) -> None:
+def recipe_of(topology: str, identities: int = IDENTITIES, poses: int = POSES) -> DatasetRecipe:
+    """A grid of Anny bodies, one shard of 100 poses after another."""
+    sizes = {"identities": {"training": identities, "evaluation": 0}, "poses": {"seen": poses, "unseen": 0}}
+    return DatasetRecipe.model_validate({"body": {"family": "anny", "topology": topology}, **sizes})
+
+
+def one_at_a_time(body: Any, parameters: np.ndarray, poses: Any, faces: np.ndarray, folder: Path) -> None:
     """Skin and write meshes singly, as NPT's data_generation.py does."""
+    rest = body._rest(parameters)
+    weights = rest.weights.toarray() if hasattr(rest.weights, "toarray") else rest.weights
     homogeneous = np.hstack([rest.vertices, np.ones((len(rest.vertices), 1))])
-    for number, rotation in enumerate(rotations):
-        transforms = joint_transforms(rest, rotation[None])[0]
-        blended = np.tensordot(rest.weights, transforms, axes=[[1], [0]])
+    world = body.world_rotations(poses)
+    for number, rotations in enumerate(world):
+        transforms = joint_transforms(rest, rotations[None])[0]
+        blended = np.tensordot(weights, transforms, axes=[[1], [0]])
         vertices = np.matmul(blended, homogeneous[..., None])[..., 0]
         with open(folder / f"0_{number}.obj", "w") as file:
             for x, y, z in vertices:
                 file.write(f"v {x:f} {y:f} {z:f}\n")
             for a, b, c in faces + 1:
                 file.write(f"f {a:d} {b:d} {c:d}\n")
+
+
+def annys_own_forward(topology: str) -> Callable[[], object]:
+    """Anny's forward pass of a batch of 100 poses of one identity, in float32 on one thread, without gradients."""
+    import anny
+    import torch
+
+    torch.set_num_threads(1)
+    model = anny.Anny(rig="mixamo", topology=topology, skinning_method="lbs").to(torch.float32)
+    turns = torch.eye(4).repeat(POSES, len(model.bone_labels), 1, 1)
+    shape = {name: torch.full((POSES,), 0.5) for name in model.phenotype_labels}
+
+    def forward() -> object:
+        with torch.no_grad():
+            return model(pose_parameters=turns, phenotype_kwargs=shape)
+
+    return forward
 
 
 def rate(work: Callable[[], object], meshes: int) -> float:
@@ -49,36 +81,121 @@ def rate(work: Callable[[], object], meshes: int) -> float:
     return meshes / (time.perf_counter() - began)
 
 
-def main() -> None:
-    """Measure and print the table."""
-    topology = sys.argv[1] if len(sys.argv) > 1 else "notoes_collapse10pc"
-    sizes = {"identities": {"training": 2, "evaluation": 2}, "poses": {"seen": POSES, "unseen": 0}}
-    recipe = DatasetRecipe.model_validate({"body": {"family": "anny", "topology": topology}, **sizes})
-    body, shard = load_body(recipe.body), Grid(recipe).shards()[0]
-    parameters = body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, 0))
+def measure(topology: str, folder: Path) -> None:
+    """Measure and print one topology's table."""
+    recipe, url = recipe_of(topology), str(folder / f"{topology}.zarr")
+    body, shards = load_body(recipe.body), Grid(recipe).shards()
+    parameters = body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, 0), 0)
     poses, faces = draw_poses(recipe.poses, range(POSES)), body.faces(parameters)
-    rest, rotations = body._rest(parameters), body._rotations(poses[:ONE_AT_A_TIME])  # type: ignore[attr-defined]
-    found: dict[str, list[float]] = {}
-    with tempfile.TemporaryDirectory() as temporary, threadpool_limits(limits=1):
-        folder, url = Path(temporary), f"{temporary}/bench.zarr"
-        prepare(url, recipe)
-        ways: dict[str, tuple[Callable[[], object], int]] = {
-            "one at a time, text OBJ": (lambda: one_at_a_time(rest, rotations, faces, folder), ONE_AT_A_TIME),
-            "body model's batch alone": (lambda: body.vertices(parameters, poses), POSES),
-            "shard: pose, check": (lambda: make_shard(recipe, shard), POSES),
-            "shard: pose, check, compress, write": (
-                lambda: write_shard(url, recipe, shard, make_shard(recipe, shard)),
-                POSES,
-            ),
-        }
-        for _ in range(ROUNDS):
-            for name, (work, meshes) in ways.items():
-                found.setdefault(name, []).append(rate(work, meshes))
-    base = statistics.median(found["one at a time, text OBJ"])
-    print(f"Anny {topology}, {faces.max() + 1:,} vertices, one process, {ROUNDS} rounds of {POSES} meshes")
-    for name, rates in found.items():
-        middle = statistics.median(rates)
-        print(f"  {name:38} {middle:8,.0f} meshes/s   x{middle / base:6.1f}")
+    prepare(url, recipe)
+    forward = annys_own_forward(topology)
+    todo = list(shards)
+    names = {
+        "one": "one at a time, text OBJ (NPT's way)",
+        "anny": "Anny's own forward, batch 100",
+        "body": "our body alone, batch 100",
+        "shard": "whole shards, to disk",
+    }
+    ways: dict[str, tuple[Callable[[], object], int]] = {
+        "one": (
+            lambda: one_at_a_time(body, parameters, poses[:ONE_AT_A_TIME], faces, folder),
+            ONE_AT_A_TIME,
+        ),
+        "anny": (forward, POSES),
+        "body": (lambda: body.vertices(parameters, poses), POSES),
+        "shard": (lambda: ensure_shard(url, recipe, todo.pop()), POSES),
+    }
+    forward(), body.vertices(parameters, poses)
+    found = {name: [] for name in ways}  # type: dict[str, list[float]]
+    for _ in range(ROUNDS):
+        for name, (work, meshes) in ways.items():
+            found[name].append(rate(work, meshes))
+    middle = {name: statistics.median(rates) for name, rates in found.items()}
+    print(f"\nAnny {topology}: {faces.max() + 1:,} vertices, one core, medians of {ROUNDS} rounds")
+    for name, label in names.items():
+        print(
+            f"  {label:38} {middle[name]:9,.0f} meshes/s   x{middle[name] / middle['one']:7.1f} NPT's way"
+            f"   x{middle[name] / middle['anny']:5.2f} Anny's forward   x{middle[name] / middle['body']:5.2f} our body"
+        )
+    reading(url, recipe, shards, folder)
+
+
+def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) -> None:
+    """Speed of reading whole shards and single meshes (decoded bytes, from the page cache), and the size."""
+    dataset, count = Dataset(url, open_group(url)), len(shards)
+    began = time.perf_counter()
+    size = sum(dataset.vertices(identity).nbytes for identity in range(count))
+    whole = size / (time.perf_counter() - began) / 1e6
+    began = time.perf_counter()
+    for place in range(100):
+        dataset.vertices(place % count, place * 37 % POSES)
+    single = 100 / (time.perf_counter() - began)
+    stored = sum((Path(url) / shard_path(shard)).stat().st_size for shard in shards) / count / POSES
+    text = np.mean([path.stat().st_size for path in folder.glob("0_*.obj")])
+    print(f"  reading: whole shards {whole:,.0f} MB/s, single meshes {single:,.0f}/s")
+    print(f"  size: {stored / 1e3:.1f} kB a mesh, {stored / text:.3f} of its OBJ")
+
+
+_WORKER = """
+import resource, sys, tempfile
+from benchmarks.generation import recipe_of
+from datagen.generate import ensure_shard, prepare
+from datagen.grid import Grid
+recipe = recipe_of(sys.argv[1], identities=int(sys.argv[2]))
+with tempfile.TemporaryDirectory() as folder:
+    prepare(f"{folder}/x.zarr", recipe)
+    for shard in Grid(recipe).shards():
+        ensure_shard(f"{folder}/x.zarr", recipe, shard)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def memory(topology: str) -> None:
+    """Peak resident memory of a worker after a small and after a larger grid."""
+    root = str(Path(__file__).parents[1])
+    peaks = []
+    for identities in (2, 12):
+        command = [sys.executable, "-c", _WORKER, topology, str(identities)]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True, cwd=root, env={**os.environ, "PYTHONPATH": root}
+        )
+        peaks.append(float(done.stdout.split()[-1]))
+    print(f"\na worker's peak memory, {topology}: {peaks[0]:,.0f} MiB for 200 meshes, {peaks[1]:,.0f} MiB for 1,200")
+
+
+def scaling(topology: str, identities: int) -> None:
+    """Whole shards a second on one and on two Ray workers, once the workers have loaded the body."""
+    import ray
+
+    from datagen.generate import ray_runner
+
+    rates = []
+    for workers in (1, 2):
+        ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
+        with tempfile.TemporaryDirectory() as folder:
+            for name, count in (("warm", 8), ("timed", identities)):
+                recipe, url = recipe_of(topology, count), f"{folder}/{name}.zarr"
+                prepare(url, recipe)
+                arguments = [(url, recipe, shard) for shard in Grid(recipe).shards()]
+                began = time.perf_counter()
+                meshes = sum(row.rows for row in ray_runner(ensure_shard, arguments))
+            rates.append(meshes / (time.perf_counter() - began))
+        ray.shutdown()
+    print(
+        f"\nRay workers, {topology}: one {rates[0]:,.0f} meshes/s, two {rates[1]:,.0f} meshes/s, "
+        f"x{rates[1] / rates[0]:.2f}"
+    )
+
+
+def main() -> None:
+    """Measure and print everything."""
+    topologies = sys.argv[1:] or ["notoes_collapse5pc", "notoes_collapse10pc", "anny"]
+    with threadpool_limits(limits=1):
+        for topology in topologies:
+            with tempfile.TemporaryDirectory() as folder:
+                measure(topology, Path(folder))
+    memory(topologies[-1])
+    scaling(topologies[-1], identities=60)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from datagen.bodies import load_body, require_joints
 from datagen.errors import BodyError, ClusterError, DatasetError
 from datagen.grid import Grid, Shard
+from datagen.mesh import bounds
 from datagen.places import is_local, remove, require_ours, writing_alone
 from datagen.poses import draw_poses, load_poses
 from datagen.recipe import DatasetRecipe, Growth
@@ -43,8 +44,8 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
     poses = Grid(recipe).rows_of(shard.identity)[shard.start : shard.stop]
     parameters = identity_parameters(recipe, body, shard.identity)
     vertices = body.vertices(parameters, draw_poses(recipe.poses, poses))
-    extent = vertices.max(axis=1) - vertices.min(axis=1)
-    if not np.isfinite(vertices).all() or (extent.max(axis=1) <= 0).any():
+    low, high = bounds(vertices)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and ((high - low).max(axis=1) > 0).all()):
         raise BodyError(
             f"identity {shard.identity} (parameters {parameters.tolist()}) has a degenerate or non-finite mesh in "
             f"poses {poses[0]} to {poses[-1]}. Narrow the identity ranges of the recipe"

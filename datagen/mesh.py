@@ -39,6 +39,28 @@ class Box:
         return vertices * self.half[..., None, None] + self.centre[..., None, :]
 
 
+def bounds(vertices: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Lowest and highest coordinates [mesh, 3] of meshes [mesh, vertex, 3]; NaN where a mesh has any.
+
+    NumPy reduces an axis before one of three numbers slowly; in groups of vertices it is some twenty times faster.
+    """
+    groups = vertices.shape[1] // _GROUP
+    grouped = vertices[:, : groups * _GROUP].reshape(len(vertices), groups, 3 * _GROUP)
+    rest = vertices[:, groups * _GROUP :]
+    return _bound(np.minimum, grouped, rest), _bound(np.maximum, grouped, rest)
+
+
+_GROUP = 128
+
+
+def _bound(extreme: np.ufunc, grouped: NDArray[np.floating], rest: NDArray[np.floating]) -> NDArray[np.floating]:
+    parts = [rest]
+    if grouped.shape[1]:
+        parts.append(extreme.reduce(grouped, axis=1).reshape(len(grouped), _GROUP, 3))
+    found: NDArray[np.floating] = extreme.reduce(np.concatenate(parts, axis=1), axis=1)
+    return found
+
+
 def bounding_box(vertices: NDArray[np.floating]) -> Box:
     """Bounding box of vertices [..., vertex, 3], the normalisation of the DSFFNet paper and of NPT.
 

@@ -71,7 +71,11 @@ class AnnyModel:
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32, feet and all where the body model puts them (no grounding)."""
-        return skin(self._rest(parameters), poses.on(self._names, self._parents) @ self._correction)
+        return skin(self._rest(parameters), self.world_rotations(poses))
+
+    def world_rotations(self, poses: Poses) -> NDArray[np.float64]:
+        """World rotations [pose, bone, 3, 3] of the rig's bones relative to their rest."""
+        return poses.on(self._names, self._parents) @ self._correction
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         import torch

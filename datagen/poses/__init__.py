@@ -100,8 +100,14 @@ def _load(recipe: str) -> PoseSource:
     return source
 
 
+@lru_cache(maxsize=20_000)
+def _drawn(source: PoseSource, pose: int) -> NDArray[np.float64]:
+    """A pose, kept: every identity takes the same ones."""
+    return source.draw(pose)
+
+
 def draw_poses(recipe: PoseRecipe, poses: NDArray[np.integer] | range) -> Poses:
     """The poses of the given numbers."""
     source = load_poses(recipe)
-    drawn = [source.draw(int(pose)) for pose in poses]
+    drawn = [_drawn(source, int(pose)) for pose in poses]
     return Poses(source.joints, source.parents, np.stack(drawn) if drawn else np.empty((0, len(source.joints), 3)))

@@ -22,6 +22,7 @@ from zarr.errors import ContainsArrayError
 from datagen.bodies import BodyModel
 from datagen.errors import DatasetError, StorageError
 from datagen.grid import POSE_TYPES, Grid, Shard
+from datagen.mesh import bounds
 from datagen.poses import draw_poses, load_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
@@ -106,9 +107,20 @@ def existing_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow
 
 
 def _row(shard: Shard, content: bytes, vertices: NDArray[np.float32]) -> ManifestRow:
-    low, high = (bound(vertices, axis=(0, 1)).astype(float).tolist() for bound in (np.min, np.max))
-    digest = hashlib.sha256(content).hexdigest()
-    return ManifestRow(shard_path(shard), shard.rows, digest, len(content), tuple(low), tuple(high))
+    low, high = bounds(vertices)
+    return ManifestRow(
+        path=shard_path(shard),
+        rows=shard.rows,
+        sha256=hashlib.sha256(content).hexdigest(),
+        bytes=len(content),
+        minimum=_triple(low.min(axis=0)),
+        maximum=_triple(high.max(axis=0)),
+    )
+
+
+def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def finish(url: str, rows: Sequence[ManifestRow]) -> None:

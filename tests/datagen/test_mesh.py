@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.errors import MeshError, StorageError
-from datagen.mesh import FORMATS, Mesh, bounding_box, check_mesh, edges_of, load_mesh, save_mesh
+from datagen.mesh import FORMATS, Mesh, bounding_box, bounds, check_mesh, edges_of, load_mesh, save_mesh
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -92,3 +92,15 @@ def test_an_obj_with_materials_groups_and_texture_seams_keeps_its_one_list_of_ve
     mesh = load_mesh(tmp_path / "person.obj")
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 3, 2]]
+
+
+@pytest.mark.parametrize("vertices", [1, 127, 128, 300])
+def test_bounds_are_those_of_each_mesh_and_show_what_is_not_finite(vertices: int) -> None:
+    meshes = np.random.default_rng(0).normal(size=(4, vertices, 3)).astype(np.float32)
+    low, high = bounds(meshes)
+    assert np.array_equal(low, meshes.min(axis=1)) and np.array_equal(high, meshes.max(axis=1))
+    for bad in (np.nan, np.inf, -np.inf):
+        spoiled = meshes.copy()
+        spoiled[2, vertices // 2, 1] = bad
+        finite = np.isfinite(np.stack(bounds(spoiled))).all(axis=(0, 2))
+        assert finite.tolist() == [True, True, False, True]
