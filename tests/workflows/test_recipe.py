@@ -54,7 +54,7 @@ def test_saved_and_read_again_it_is_the_same(tmp_path: Path) -> None:
         (["training.batch=many"], r"training.batch: .*integer.*\(given: 'many'\)"),
         (["training.batch=0"], r"training.batch: .*greater than or equal to 1 \(given: 0\)"),
         (["training.batch=9"], r"batch 9 cannot be shared equally by 2 ranks"),
-        (["data.body.family=smurf"], r"data.body: .*'anny', 'leg'"),
+        (["data.body.family=smurf"], r"data.body: .*'anny', 'smpl'"),
         (["data.body.phenotypes.age=[0.9,0.1]"], r"data.body.phenotypes: .*age: need 0 <= low <= high <= 1"),
         (["training.steps"], r"--set 'training.steps' is not of the form section.key=value"),
     ],
