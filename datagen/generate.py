@@ -18,10 +18,11 @@ from datagen.mesh import bounds
 from datagen.places import is_local, remove, require_ours, writing_alone
 from datagen.poses import draw_poses, load_poses
 from datagen.recipe import DatasetRecipe, Growth
-from datagen.store.reader import Dataset, open_dataset, read_manifest
+from datagen.store.manifest import read_manifest
+from datagen.store.reader import Dataset, open_dataset
 from datagen.store.schema import ManifestRow, open_group, stored_recipe
 from datagen.store.verify import Fault, find_faults
-from datagen.store.writer import begin, existing_shard, finish, grow, identity_parameters, write_shard
+from datagen.store.writer import begin, existing_shard, finish, grow, identity_parameters, restate, write_shard
 
 log = logging.getLogger(__name__)
 _SILENCE = 120.0  # seconds without a finished task before a person is told
@@ -207,8 +208,9 @@ def repair(
     run: Runner = inline,
     progress: Progress = lambda rows, grid: rows,
 ) -> Dataset:
-    """Make the faulty shards again and check that the dataset is whole; the others are not touched."""
+    """Make the faulty shards and other objects again and check that the dataset is whole; the rest is not touched."""
     with writing_alone(url):
+        list(run(_restate, [(url, recipe, [fault.path for fault in faults if not fault.shard])]))
         list(run(prepare, [(url, recipe)]))
         before = {row.path: row.sha256 for row in read_manifest(open_group(url))}
         for row in run(_remake, [(url, recipe, fault.shard) for fault in faults if fault.shard]):
@@ -222,6 +224,11 @@ def repair(
     if left:
         raise DatasetError(f"{url}: {left[0].path} is still faulty after repair ({left[0].reason})")
     return open_dataset(url)
+
+
+def _restate(url: str, recipe: DatasetRecipe, objects: list[str]) -> None:
+    if objects:
+        restate(url, recipe, load_body(recipe.body), [path for path in objects if path != "zarr.json"])
 
 
 def _remake(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow:

@@ -101,13 +101,14 @@ def _load(recipe: str) -> PoseSource:
 
 
 @lru_cache(maxsize=20_000)
-def _drawn(source: PoseSource, pose: int) -> NDArray[np.float64]:
+def _drawn(recipe: str, pose: int) -> NDArray[np.float64]:
     """A pose, kept: every identity takes the same ones."""
-    return source.draw(pose)
+    return _load(recipe).draw(pose)
 
 
 def draw_poses(recipe: PoseRecipe, poses: NDArray[np.integer] | range) -> Poses:
     """The poses of the given numbers."""
     source = load_poses(recipe)
-    drawn = [_drawn(source, int(pose)) for pose in poses]
+    key = recipe.model_dump_json()
+    drawn = [_drawn(key, int(pose)) for pose in poses]
     return Poses(source.joints, source.parents, np.stack(drawn) if drawn else np.empty((0, len(source.joints), 3)))

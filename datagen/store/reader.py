@@ -15,6 +15,7 @@ from datagen.grid import Grid, PoseType, Split
 from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardCodec, ShardDamage
+from datagen.store.manifest import is_sealed, manifest_is_the_committed_one, read_manifest
 from datagen.store.schema import (
     ManifestRow,
     array_at,
@@ -150,14 +151,6 @@ class Dataset:
         return f"Mend it: dsffnet verify {self.url} --repair"
 
 
-def read_manifest(group: zarr.Group) -> list[ManifestRow]:
-    """Manifest rows of a group, empty where there is no manifest yet."""
-    if "manifest" not in group:
-        return []
-    manifest = group.require_group("manifest")
-    return [ManifestRow.from_json(row) for row in attributes_of(manifest).get("shards", [])]
-
-
 def open_dataset(url: str) -> Dataset:
     """Open a complete dataset and check that every shard of its manifest is there with its size.
 
@@ -176,8 +169,7 @@ def open_dataset(url: str) -> Dataset:
             f"{url} is incomplete (status {status!r}). Finish it: run the command that made it again, "
             f"or dsffnet verify {url} --repair"
         )
-    manifest = read_manifest(group)
-    faults = list(_quick_faults(group, manifest))
+    faults = list(_quick_faults(group, read_manifest(group)))
     if faults:
         more = f" and {len(faults) - 1} more" if len(faults) > 1 else ""
         raise DatasetError(f"{url}: {faults[0]}{more}. Mend it: dsffnet verify {url} --repair")
@@ -185,6 +177,10 @@ def open_dataset(url: str) -> Dataset:
 
 
 def _quick_faults(group: zarr.Group, manifest: list[ManifestRow]) -> Iterator[str]:
+    if not is_sealed(group):
+        yield "its attributes (zarr.json) are not as they were written"
+    if not manifest_is_the_committed_one(group):
+        yield "its manifest is not the one that was committed"
     sizes = stored_sizes(group, [row.path for row in manifest])
     for row in manifest:
         if row.path not in sizes:

@@ -138,6 +138,21 @@ def write_bytes(group: zarr.Group, path: str, content: bytes) -> None:
     sync(group.store.set(_key(group, path), default_buffer_prototype().buffer.from_bytes(content)))
 
 
+def delete_object(group: zarr.Group, path: str) -> None:
+    """Remove one object of the dataset's store, if it is there."""
+    sync(group.store.delete(_key(group, path)))
+
+
+def list_objects(group: zarr.Group) -> list[str]:
+    """Paths of all objects of the dataset's store, sorted."""
+    prefix = f"{group.path}/" if group.path else ""
+
+    async def listed() -> list[str]:
+        return [key async for key in group.store.list_prefix(prefix)]
+
+    return sorted(key.removeprefix(prefix) for key in sync(listed()))
+
+
 def _key(group: zarr.Group, path: str) -> str:
     return f"{group.path}/{path}" if group.path else path
 

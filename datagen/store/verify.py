@@ -5,18 +5,16 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import zarr
 
 from datagen.grid import Grid, Shard
 from datagen.recipe import DatasetRecipe
-from datagen.store.reader import read_manifest
+from datagen.store.manifest import changed_objects, is_sealed, manifest_is_the_committed_one, read_manifest
 from datagen.store.schema import (
     ManifestRow,
     array_at,
     attributes_of,
     check_version,
-    identity_name,
     open_group,
     read_bytes,
     shard_path,
@@ -39,42 +37,38 @@ class Fault:
 
 
 def find_faults(url: str, *, progress: Progress = iter) -> Iterator[Fault]:
-    """Check every shard of the dataset's grid (present, hash as in the manifest, decodable, finite), then the rest."""
+    """Check everything: each shard of the dataset's grid, then every other object, by the hashes of the manifest.
+
+    Where a dataset is still being made there is no manifest; its shards are decoded instead.
+    """
     group = open_group(url)
     grid = Grid(require_recipe(url))
     manifest = {row.path: row for row in read_manifest(group)}
     for shard in progress(grid.shards()):
-        reason = _fault(url, grid.recipe, shard, read_bytes(group, shard_path(shard)), manifest.get(shard_path(shard)))
+        reason = _fault(url, grid.recipe, shard, manifest.get(shard_path(shard)))
         if reason:
             yield Fault(shard_path(shard), reason, shard)
-    yield from _small_faults(group, grid)
+    yield from (Fault(path, reason) for path, reason in changed_objects(group))
+    if attributes_of(group)["status"] == "complete":
+        yield from _root_faults(group)
 
 
-def _small_faults(group: zarr.Group, grid: Grid) -> Iterator[Fault]:
-    homes = [f"identity/{identity_name(identity)}" for identity in range(grid.identity_count)]
-    paths = ["pose/parameters", "evaluation/seen", "evaluation/unseen"]
-    paths += [f"{home}/{name}" for home in homes for name in ("pose", "parameters")]
-    topologies = {str(group[home].attrs.get("topology", "?")) for home in homes if home in group}
-    paths += [f"topology/{topology}/faces" for topology in sorted(topologies)]
-    for path in paths:
-        try:
-            np.asarray(array_at(group, path)[...])
-        except KeyError:
-            yield Fault(path, "missing")
-        except (RuntimeError, ValueError, OSError) as error:
-            yield Fault(path, f"cannot be read ({error})")
+def _root_faults(group: zarr.Group) -> Iterator[Fault]:
+    if not is_sealed(group):
+        yield Fault("zarr.json", "its attributes are not as they were written")
+    if not manifest_is_the_committed_one(group):
+        yield Fault("manifest/zarr.json", "not the manifest that was committed")
 
 
-def _fault(url: str, recipe: DatasetRecipe, shard: Shard, raw: bytes | None, row: ManifestRow | None) -> str | None:
-    if raw is None:
+def _fault(url: str, recipe: DatasetRecipe, shard: Shard, row: ManifestRow | None) -> str | None:
+    if row is None:
+        return None if existing_shard(url, recipe, shard) else "missing or damaged"
+    content = read_bytes(open_group(url), shard_path(shard))
+    if content is None:
         return "missing"
-    if row is not None and len(raw) != row.bytes:
-        return f"{len(raw)} bytes instead of {row.bytes}"
-    if row is not None and hashlib.sha256(raw).hexdigest() != row.sha256:
-        return "its sha256 is not the manifest's"
-    if existing_shard(url, recipe, shard) is None:
-        return "cannot be decoded"
-    return None
+    if len(content) != row.bytes:
+        return f"{len(content)} bytes instead of {row.bytes}"
+    return None if hashlib.sha256(content).hexdigest() == row.sha256 else "its sha256 is not the manifest's"
 
 
 def describe(url: str) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from datagen.poses import draw_poses, load_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardDamage
+from datagen.store.manifest import commit
 from datagen.store.schema import (
     FORMAT_VERSION,
     ManifestRow,
@@ -35,7 +36,9 @@ from datagen.store.schema import (
     check_version,
     codec_of,
     create_vertices_array,
+    delete_object,
     identity_name,
+    list_objects,
     open_group,
     read_bytes,
     shard_path,
@@ -77,7 +80,7 @@ def grow(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
     with _writing(url):
         group = open_group(url, mode="r+")
         _check_same_assets(url, group, _assets(recipe, body))
-        group.update_attributes(_attributes(recipe, body))
+        group.update_attributes(_attributes(recipe, body, attributes_of(group)["provenance"]))
 
 
 def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
@@ -124,22 +127,32 @@ def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
 
 
 def finish(url: str, rows: Sequence[ManifestRow]) -> None:
-    """Commit the manifest, then the statistics, then ``status: complete``."""
-    ordered = sorted(rows)
+    """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files."""
+    statistics = {
+        "meshes": sum(row.rows for row in rows),
+        "bytes": sum(row.bytes for row in rows),
+        "minimum": np.min([row.minimum for row in rows], axis=0).tolist(),
+        "maximum": np.max([row.maximum for row in rows], axis=0).tolist(),
+    }
     with _writing(url):
         group = open_group(url, mode="r+")
-        group.require_group("manifest").update_attributes({"shards": [row.as_json() for row in ordered]})
-        digest = hashlib.sha256("\n".join(row.sha256 for row in ordered).encode()).hexdigest()
-        statistics = {
-            "meshes": sum(row.rows for row in ordered),
-            "bytes": sum(row.bytes for row in ordered),
-            "minimum": np.min([row.minimum for row in ordered], axis=0).tolist(),
-            "maximum": np.max([row.maximum for row in ordered], axis=0).tolist(),
-        }
-        group.update_attributes({"statistics": statistics, "manifest_sha256": digest, "status": "complete"})
+        for path in list_objects(group):
+            if path.endswith(".partial"):
+                delete_object(group, path)
+        commit(group, rows, {"statistics": statistics, "status": "complete"})
 
 
-def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
+def restate(url: str, recipe: DatasetRecipe, body: BodyModel, objects: Sequence[str]) -> None:
+    """Write the root's attributes and these other objects anew: they were lost or changed."""
+    with _writing(url):
+        group = open_group(url, mode="r+")
+        check_same_recipe(url, group, recipe)
+        group.update_attributes(_attributes(recipe, body, attributes_of(group).get("provenance")))
+        for path in objects:
+            delete_object(group, path)
+
+
+def _attributes(recipe: DatasetRecipe, body: BodyModel, provenance: Any = None) -> dict[str, Any]:
     grid, digest = Grid(recipe), recipe.sha256()
     assets, poses = _assets(recipe, body), load_poses(recipe.poses)
     return {
@@ -149,7 +162,7 @@ def _attributes(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
         "recipe": recipe.model_dump(mode="json"),
         "recipe_sha256": digest,
         "body": {"family": recipe.body.family, "assets": assets, "parameters": list(body.parameter_names)},
-        "provenance": {"packages": _versions(), "git_commit": _git_commit()},
+        "provenance": _provenance(provenance),
         "units": "metres",
         "frame": "Y up, facing +Z, +X to the body's left",
         "joints": list(poses.joints),
@@ -174,6 +187,8 @@ def _spans(numbers: NDArray[np.int64]) -> list[list[int]]:
 
 def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
     grid = Grid(recipe)
+    for name in ("topology", "identity", "pose", "evaluation", "manifest"):
+        group.require_group(name)
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
     for pose_type in POSE_TYPES:
@@ -183,6 +198,7 @@ def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) ->
         parameters = identity_parameters(recipe, body, identity)
         faces = body.faces(parameters)
         topology = topologies.setdefault(faces.tobytes(), str(len(topologies)))
+        group.require_group(f"topology/{topology}")
         _put(group, f"topology/{topology}/faces", faces, ("face", "corner"))
         _create_identity(group, grid, identity, parameters, int(faces.max()) + 1, topology)
 
@@ -271,6 +287,16 @@ def _writing(url: str) -> Iterator[None]:
             f"could not write to {url}: {error.strerror or error}. What was complete is untouched; "
             "make room or choose another --out, then run the same command again"
         ) from error
+
+
+def _provenance(earlier: Any) -> dict[str, Any]:
+    """What makes the data here and now, and what made the part that is there already, if that was something else."""
+    now = {"packages": _versions(), "git_commit": _git_commit()}
+    before = dict(earlier) if isinstance(earlier, dict) else {}
+    history = before.pop("earlier", [])
+    if before and before != now:
+        history = [*history, before]
+    return {**now, "earlier": history} if history else now
 
 
 def _versions() -> dict[str, str]:

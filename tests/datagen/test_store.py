@@ -95,13 +95,62 @@ def test_repair_brings_the_very_same_bytes_back_and_touches_no_other_shard(
     assert {path: path.stat().st_mtime_ns for path in others} == others
 
 
-def test_damaged_faces_are_found_and_mended(dataset: str, spoilable: Path) -> None:
-    chunk = spoilable / "topology/0/faces/c/0/0"
-    flip_bit(chunk)
+def small_objects(url: Path) -> list[Path]:
+    files = (path for path in url.rglob("*") if path.is_file() and "/vertices/c/" not in str(path))
+    return [path for path in sorted(files) if path != url / "zarr.json"]
+
+
+@pytest.mark.parametrize("spoil", [flip_bit, Path.unlink], ids=["bit flip", "loss"])
+def test_every_other_object_that_is_spoiled_is_found_and_mended(dataset: str, spoilable: Path, spoil) -> None:
+    assert len(small_objects(spoilable)) > 30
+    for path in small_objects(spoilable):
+        spoil(path)
+        faults = list(find_faults(str(spoilable)))
+        assert [fault.path for fault in faults if not fault.shard][:1] == [str(path.relative_to(spoilable))], path
+        repair(str(spoilable), tiny_dataset(), faults)
+        assert tree_hash(spoilable) == tree_hash(dataset), path
+
+
+def test_attributes_changed_by_hand_are_refused_and_mended(dataset: str, spoilable: Path) -> None:
+    text = (spoilable / "zarr.json").read_text()
+    (spoilable / "zarr.json").write_text(text.replace('"0003": "evaluation"', '"0003": "training"', 1))
+    with pytest.raises(DatasetError, match=r"attributes \(zarr.json\) are not as they were written.*--repair"):
+        open_dataset(str(spoilable))
     faults = list(find_faults(str(spoilable)))
-    assert [fault.path for fault in faults] == ["topology/0/faces"]
+    assert [fault.path for fault in faults] == ["zarr.json"]
     repair(str(spoilable), tiny_dataset(), faults)
     assert tree_hash(spoilable) == tree_hash(dataset)
+
+
+def test_a_recipe_changed_by_hand_is_refused(spoilable: Path) -> None:
+    text = (spoilable / "zarr.json").read_text()
+    (spoilable / "zarr.json").write_text(text.replace('"training": 3', '"training": 2', 1))
+    with pytest.raises(DatasetError, match="attributes"):
+        open_dataset(str(spoilable))
+
+
+def test_a_manifest_that_is_not_the_committed_one(spoilable: Path) -> None:
+    manifest = spoilable / "manifest/zarr.json"
+    manifest.write_text(manifest.read_text().replace('"rows": 4', '"rows": 3', 1))
+    with pytest.raises(DatasetError, match="its manifest is not the one that was committed"):
+        open_dataset(str(spoilable))
+
+
+def test_what_a_killed_writer_left_of_a_file_is_removed(dataset: str, spoilable: Path) -> None:
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    (spoilable / "identity/0001/vertices/c/0/0/0.1234abcd.partial").write_bytes(b"half a shard")
+    generate(tiny_dataset(), str(spoilable))
+    assert tree_hash(spoilable) == tree_hash(dataset)
+
+
+def test_provenance_names_what_made_the_part_that_was_there(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.generate import append
+    from datagen.store import writer
+
+    before = open_dataset(str(spoilable)).attributes["provenance"]
+    monkeypatch.setattr(writer, "_git_commit", lambda: "another")
+    after = append(str(spoilable), training=4).attributes["provenance"]
+    assert after["git_commit"] == "another" and after["earlier"] == [before]
 
 
 def test_unfinished_dataset_is_refused_but_can_be_described(spoilable: Path) -> None:
