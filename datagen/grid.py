@@ -21,6 +21,7 @@ from datagen.recipe import DatasetRecipe, Growth
 PoseType = Literal["seen", "unseen"]
 Split = Literal["training", "evaluation"]
 POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
+SPLITS: tuple[Split, ...] = ("training", "evaluation")
 HOLE = -1
 """The pose number of a row that holds no mesh."""
 
@@ -119,7 +120,7 @@ class Grid:
 
     @cached_property
     def _rows(self) -> dict[Split, NDArray[np.int64]]:
-        return {split: self._rows_in(split) for split in ("training", "evaluation")}
+        return {split: self._rows_in(split) for split in SPLITS}
 
     def _rows_in(self, split: Split) -> NDArray[np.int64]:
         rows: NDArray[np.int64] = np.empty(0, np.int64)

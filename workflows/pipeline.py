@@ -212,14 +212,18 @@ def about_dataset(dataset: Dataset) -> dict[str, str]:
 
 
 def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, poses: int = 8) -> Path:
-    """A picture of some identities (rows) in some poses (columns), both spread over the whole grid."""
+    """A picture of some identities (rows) in some poses (columns), both spread over the whole grid.
+
+    Where training identities have no unseen poses, the seen ones are shown.
+    """
     grid = dataset.grid
     chosen = np.unique(np.linspace(0, grid.identity_count - 1, identities).astype(int)).tolist()
-    columns = np.unique(np.linspace(0, len(grid.poses_of(0)) - 1, poses).astype(int)).tolist()
-    meshes = [[_standing(dataset.vertices(i, p)) for p in columns] for i in chosen]
+    common = set.intersection(*(set(grid.poses_of(identity).tolist()) for identity in chosen))
+    columns = [sorted(common)[i] for i in np.unique(np.linspace(0, len(common) - 1, poses).astype(int))]
+    meshes = [[_standing(vertices) for vertices in dataset.vertices(i, columns)] for i in chosen]
     labels = [f"identity {i}\n{grid.split(i)}" for i in chosen]
     faces = [dataset.faces(i) for i in chosen]
-    return contact_sheet(meshes, faces, labels, [f"pose {p}" for p in columns], path)
+    return contact_sheet(meshes, faces, labels, [f"pose {p} ({grid.pose_type(p)})" for p in columns], path)
 
 
 def _standing(vertices: np.ndarray) -> np.ndarray:

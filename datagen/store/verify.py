@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import zarr
 
-from datagen.grid import Grid, Shard
-from datagen.recipe import DatasetRecipe
+from datagen.grid import POSE_TYPES, SPLITS, Grid, Shard
+from datagen.recipe import DatasetRecipe, MixedBody
 from datagen.store.manifest import changed_objects, is_sealed, manifest_is_the_committed_one, read_manifest
 from datagen.store.schema import (
     ManifestRow,
@@ -80,25 +81,58 @@ def describe(url: str) -> dict[str, Any]:
     grid = Grid(recipe)
     shards = grid.shards()
     sizes = stored_sizes(group, [shard_path(shard) for shard in shards])
-    return {
+    facts = {
         "dataset": url,
         "status": attributes["status"],
         "uuid": attributes["uuid"],
-        "body": f"{recipe.body.family} {_topology(recipe)}".strip(),
-        "identities": f"{recipe.identities.training} training, {recipe.identities.evaluation} evaluation",
-        "poses": f"{recipe.poses.seen} seen, {recipe.poses.unseen} unseen ({recipe.poses.distribution})",
+        "body": f"{recipe.body.family} {_kind(recipe)}".strip(),
+        "identities": ", ".join(f"{_count(grid.identities(split))} {split}" for split in SPLITS),
+        "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
+        f"({recipe.poses.distribution.name}, {len(attributes['joints'])} joints)",
+        "appended": _growth(recipe),
         "meshes": f"{grid.mesh_count:,} of {_vertex_counts(group, grid)} vertices",
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
-        "evaluation triples": f"{recipe.triples.count} for each pose type",
+        "extent": _extent(attributes),
+        "evaluation triples": ", ".join(f"{len(grid.evaluation_triples(kind))} {kind}" for kind in POSE_TYPES),
         "assets": "; ".join(f"{a['name']} {a['version']} ({a['licence']})" for a in attributes["body"]["assets"]),
         "packages": ", ".join(f"{name} {version}" for name, version in attributes["provenance"]["packages"].items()),
         "git commit": attributes["provenance"]["git_commit"],
         "recipe sha256": attributes["recipe_sha256"],
     }
+    return {name: fact for name, fact in facts.items() if fact}
 
 
-def _topology(recipe: DatasetRecipe) -> str:
-    return str(getattr(recipe.body, "topology", ""))
+def _count(numbers: list[int]) -> str:
+    """How many, and which numbers."""
+    if not numbers:
+        return "0"
+    spans = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    words = (f"{span[0]}-{span[-1]}" if len(span) > 1 else str(span[0]) for span in spans)
+    return f"{len(numbers)} ({', '.join(words)})"
+
+
+def _growth(recipe: DatasetRecipe) -> str:
+    steps = (
+        ", ".join(f"{count} {name}" for name, count in step.model_dump().items() if count) for step in recipe.growth
+    )
+    return "; then ".join(steps)
+
+
+def _extent(attributes: dict[str, Any]) -> str:
+    found = attributes.get("statistics")
+    if not found:
+        return ""
+    sides = np.subtract(found["maximum"], found["minimum"])
+    return " x ".join(f"{side:.2f}" for side in sides) + " m, all meshes together"
+
+
+def _kind(recipe: DatasetRecipe) -> str:
+    """The one word that says which of its family a body is."""
+    body = recipe.body
+    if isinstance(body, MixedBody):
+        return "of " + ", ".join(part.family for part in body.bodies)
+    words = (getattr(body, name, None) for name in ("topology", "model", "layout", "characters", "path"))
+    return next((word if isinstance(word, str) else ", ".join(word) for word in words if word), "")
 
 
 def _vertex_counts(group: zarr.Group, grid: Grid) -> str:
