@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import MeshError, StorageError
+from datagen.obj import read_plain
 
 FORMATS = (".obj", ".ply", ".off", ".glb", ".stl")
 
@@ -96,6 +97,9 @@ def _single_geometry(path: Path) -> Mesh:
     import trimesh
 
     try:
+        plain = read_plain(path.read_bytes()) if path.suffix.lower() == ".obj" else None
+        if plain:
+            return Mesh(*plain)
         source: Any = _plain_obj(path) if path.suffix.lower() == ".obj" else path
         scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, maintain_order=True)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]

@@ -110,6 +110,9 @@ class RiggedBody(Frozen):
     height: float = Field(0.0, ge=0, description="metres from feet to highest point at rest; 0: as in the file")
 
 
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
 class ImportedBody(Frozen):
     """Meshes that exist already, as files: nothing is synthesised, but everything else holds."""
 
@@ -119,6 +122,30 @@ class ImportedBody(Frozen):
         description="faust: tr_reg_NNN.ply; multigarment: folders with smpl_registered.obj; npt: I_P.obj or idI_P.obj",
     )
     path: str = Field("", description="the folder. Not part of the dataset's identity: the files' hash is")
+    identities: tuple[int | str, ...] = Field(
+        (),
+        description="which identities, by the number or name in their files, in the dataset's order (training first); "
+        "16-29 is a run of numbers; empty: all, ascending",
+    )
+    poses: tuple[int | str, ...] = Field(
+        (),
+        description="which poses, by the number in their files, in the dataset's order (seen first); 600-799 is a run "
+        "of numbers; empty: all, ascending",
+    )
+    up: Axis = Field("y", description="the files' axis that points from feet to head")
+    forward: Axis = Field("z", description="the files' axis that the bodies face")
+    unit: float = Field(1.0, gt=0, description="metres in one unit of the files: 0.01 for centimetres")
+    test_list: str | None = Field(
+        None,
+        description="a published list of evaluation triples, lines of: identity_mesh pose_mesh truth_mesh. Not part of "
+        "the dataset's identity: its hash is",
+    )
+
+    @model_validator(mode="after")
+    def _up_is_not_forward(self) -> "ImportedBody":
+        if self.up[-1] == self.forward[-1]:
+            raise ValueError(f"up ({self.up}) and forward ({self.forward}) lie along one axis")
+        return self
 
 
 SingleBody = Annotated[
@@ -188,11 +215,21 @@ class AmassPoses(Frozen):
 
     name: Literal["amass"] = "amass"
     path: str = Field("", description="a motion file, or a folder that is searched for them")
-    held_out: float = Field(0.0, ge=0, lt=1, description="share of the files that only unseen poses are taken from")
+    held_out: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="share of the files that unseen poses, and only they, are taken from; 0: all share all",
+    )
+    root: Literal["keep", "upright", "drop"] = Field(
+        "upright",
+        description="the body's rotation as a whole. upright: without its turn about the vertical, so that bodies face "
+        "+Z but lean and lie as recorded; keep: as recorded; drop: none",
+    )
 
 
 class FilePoses(Frozen):
-    """The poses of a .npz file: `poses` [pose, joint, 3] axis-angle in radians, `joints` names; used in their order."""
+    """The poses of a .npz file in their order: `poses` [pose, joint, 3] axis-angle in radians, `joints`, `parents`."""
 
     name: Literal["file"] = "file"
     path: str = Field("", description="the file. Not part of the dataset's identity: its hash is")
@@ -265,7 +302,7 @@ class DatasetRecipe(Frozen):
         return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-_PATHS = {"path", "families"}
+_PATHS = {"path", "families", "test_list"}
 
 
 def _without_paths(value: Any) -> Any:

@@ -80,9 +80,9 @@ class PoseSource(Protocol):
 SOURCES = {
     "npt": "datagen.poses.ranges:NptSource",
     "ranges": "datagen.poses.ranges:RangeSource",
-    "found": "datagen.poses.ranges:FoundSource",
+    "found": "datagen.poses.files:FoundSource",
     "clips": "datagen.poses.clips:ClipSource",
-    "amass": "datagen.poses.files:AmassSource",
+    "amass": "datagen.poses.amass:AmassSource",
     "file": "datagen.poses.files:FileSource",
 }
 

@@ -109,21 +109,6 @@ class RangeSource:
         return _draw(self._draws, self.joints, generator(self._seed, Stream.POSE, pose))
 
 
-class FoundSource:
-    """See :class:`datagen.poses.PoseSource`: the numbered poses of imported meshes, whose joints nobody knows."""
-
-    joints: tuple[str, ...] = ()
-    parents: tuple[int, ...] = ()
-    assets: tuple[Asset, ...] = ()
-
-    def __init__(self, recipe: PoseRecipe) -> None:
-        pass
-
-    def draw(self, pose: int) -> NDArray[np.float64]:
-        """An empty array [0, 3]."""
-        return np.empty((0, 3))
-
-
 def skeleton(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Joint names and parents of a skeleton by name: smpl, smal, or animals (the CC0 glTF animals' shared joints)."""
     if name == "animals":

@@ -1,0 +1,166 @@
+"""Datasets as mesh files: in the layout that peers' code trains on, or as folders for people to look through."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.errors import DatasetError, RecipeError
+from datagen.grid import POSE_TYPES
+from datagen.mesh import Mesh, save_mesh, write_atomically
+from datagen.obj import face_lines, vertex_lines
+from datagen.store import Dataset
+
+ExportLayout = Literal["npt-obj", "npt-ply", "obj", "ply", "glb"]
+Cell = tuple[int, int]
+"""An identity and a pose."""
+Progress = Callable[[Sequence[Cell]], Iterable[Cell]]
+
+
+@dataclass(frozen=True)
+class _Names:
+    layout: ExportLayout
+    prefix: str
+
+    @property
+    def flat(self) -> bool:
+        return self.layout.startswith("npt-")
+
+    def of(self, cell: Cell) -> str:
+        """Path of a mesh's file within the folder."""
+        suffix = self.layout.removeprefix("npt-")
+        if self.flat:
+            return f"{self.prefix}{cell[0]}_{cell[1]}.{suffix}"
+        return f"identity-{cell[0]:04d}/pose-{cell[1]:04d}.{suffix}"
+
+
+def export_dataset(
+    dataset: Dataset,
+    folder: str | Path,
+    *,
+    layout: ExportLayout,
+    identities: Iterable[int] | None = None,
+    poses: Iterable[int] | None = None,
+    prefix: str = "",
+    fresh: bool = False,
+    progress: Progress = iter,
+) -> int:
+    """Write the meshes of a dataset as files and return how many were written.
+
+    A file appears whole or not at all, and one that is there is left as it is; so an export that was interrupted goes
+    on where it stopped. Coordinates are the dataset's: metres, Y up, facing +Z, not normalised.
+
+    Parameters
+    ----------
+    dataset, folder
+        What to write, and where.
+    layout
+        ``npt-obj`` and ``npt-ply``: one folder of ``{identity}_{pose}.obj``, and the evaluation triples as text lists
+        in the published order (target, source, truth). ``obj``, ``ply``, ``glb``: ``identity-0003/pose-0012.glb``.
+    identities, poses
+        Which ones, by number; without them all. An identity is written in those poses that it was made in.
+    prefix
+        What file names begin with in the npt layouts: nothing for NPT's code, ``id`` for 3D-CoreNet's people,
+        ``toy_`` for its animals.
+    fresh
+        Write every file again.
+    progress
+        Wraps the sequence of meshes, for a progress bar.
+
+    Raises
+    ------
+    RecipeError
+        A layout, identity or pose that does not exist.
+    DatasetError
+        The folder holds something other than an export of this dataset in this layout.
+    StorageError
+        A file could not be written, such as on a full disk; those that are there are whole.
+    """
+    if layout not in get_args(ExportLayout):
+        raise RecipeError(f"no layout {layout!r} to export to; there are {', '.join(get_args(ExportLayout))}")
+    place, names, cells = Path(folder), _Names(layout, prefix), _cells(dataset, identities, poses)
+    _claim(place, _readme(dataset, names))
+    topology = lru_cache(maxsize=1)(lambda identity: _Topology(dataset.faces(identity)))
+    written = 0
+    for identity, pose in progress(cells):
+        path = place / names.of((identity, pose))
+        if fresh or not path.exists():
+            topology(identity).save(dataset.vertices(identity, pose), path)
+            written += 1
+    if names.flat:
+        _write_lists(dataset, place, names)
+    return written
+
+
+class _Topology:
+    """The faces [face, 3] of an identity, whose lines in OBJ files are made once for all of its poses."""
+
+    def __init__(self, faces: NDArray[np.int32]) -> None:
+        self._faces = faces
+        self._lines = ""
+
+    def save(self, vertices: NDArray[np.float32], path: Path) -> None:
+        if path.suffix != ".obj":
+            save_mesh(Mesh(vertices, self._faces), path)
+            return
+        self._lines = self._lines or face_lines(self._faces)
+        write_atomically(path, (vertex_lines(vertices) + self._lines).encode())
+
+
+def _cells(dataset: Dataset, identities: Iterable[int] | None, poses: Iterable[int] | None) -> list[Cell]:
+    grid = dataset.grid
+    wanted = list(range(grid.identity_count) if identities is None else identities)
+    kept = None if poses is None else set(poses)
+    _require("identity", wanted, grid.identity_count)
+    _require("pose", kept or (), grid.pose_count)
+    made = ((identity, int(pose)) for identity in wanted for pose in grid.poses_of(identity))
+    cells = [cell for cell in made if kept is None or cell[1] in kept]
+    if not cells:
+        raise RecipeError(
+            f"nothing to export: none of these identities was made in these poses. dsffnet inspect {dataset.url} shows "
+            "what there is; training identities are in the seen poses only"
+        )
+    return cells
+
+
+def _require(what: str, numbers: Iterable[int], count: int) -> None:
+    for number in numbers:
+        if not 0 <= number < count:
+            raise RecipeError(f"there is no {what} {number} to export; the dataset's are 0 to {count - 1}")
+
+
+def _readme(dataset: Dataset, names: _Names) -> str:
+    attributes = dataset.attributes
+    return (
+        f"Meshes of the dataset {dataset.uuid}, such as {names.of((0, 0))}, which is identity 0 in pose 0.\n"
+        f"Unit: {attributes['units']}. Frame: {attributes['frame']}. Vertices are in the dataset's order.\n"
+    )
+
+
+def _claim(place: Path, readme: str) -> None:
+    """Make sure that whatever is in the folder is of this very export: files that are there are not written again."""
+    said = place / "README.txt"
+    if place.is_dir() and any(not entry.name.startswith(".") for entry in place.iterdir()):
+        if not said.is_file() or said.read_bytes() != readme.encode():
+            raise DatasetError(
+                f"{place} holds other files than an export of this dataset in this layout. Choose another folder"
+            )
+        return
+    write_atomically(said, readme.encode())
+
+
+def _write_lists(dataset: Dataset, place: Path, names: _Names) -> None:
+    """The evaluation triples whose three meshes are there, one a line: target, source, truth."""
+    there = {path.name for path in place.iterdir()}
+    for pose_type in POSE_TYPES:
+        lines = []
+        for source, source_pose, target, target_pose in dataset.evaluation_triples(pose_type).tolist():
+            triple = [names.of(cell) for cell in ((target, target_pose), (source, source_pose), (target, source_pose))]
+            if there.issuperset(triple):
+                lines.append(" ".join(triple) + "\n")
+        if lines:
+            write_atomically(place / f"evaluation-{pose_type}.txt", "".join(lines).encode())
