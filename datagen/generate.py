@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from datagen.bodies import load_body, require_joints
 from datagen.errors import BodyError, ClusterError, DatasetError
 from datagen.grid import Grid, Shard
+from datagen.importers import require_files
 from datagen.mesh import bounds
 from datagen.places import is_local, remove, require_ours, writing_alone
 from datagen.poses import draw_poses, load_poses
@@ -63,6 +64,10 @@ def prepare(url: str, recipe: DatasetRecipe, growing: bool = False) -> None:
     """Load the body model and the poses, check that they fit, and create the dataset's metadata."""
     body, poses = load_body(recipe.body), load_poses(recipe.poses)
     require_joints(body, poses, family=recipe.body.family)
+    require_files(recipe)
+    draw_poses(
+        recipe.poses, range(Grid(recipe).pose_count)
+    )  # a source that has too few says so before anything is written
     if growing:
         grow(url, recipe, body)
     begin(url, recipe, body)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import BodyError
-from datagen.grid import Grid
+from datagen.grid import POSE_TYPES, Grid, PoseType
 from datagen.layouts import Cell, FoundMeshes, Layout, find_meshes
 from datagen.recipe import DatasetRecipe, ImportedBody, MixedBody
 
@@ -114,6 +114,34 @@ def _require_cells(meshes: FoundMeshes, poses: list[list[int]]) -> None:
 def listed_triples(body: ImportedBody) -> NDArray[np.int32] | None:
     """The published evaluation triples of an imported set (see :func:`read_test_list`), None where none are named."""
     return read_test_list(body.test_list, find_meshes(body)) if body.test_list else None
+
+
+def evaluation_lists(grid: Grid) -> dict[PoseType, NDArray[np.int32]]:
+    """The evaluation triples of each pose type [triple, 4]: the published ones of an imported set, or the grid's own.
+
+    Raises
+    ------
+    BodyError
+        A published triple needs a mesh that is not in the grid.
+    """
+    body = grid.recipe.body
+    listed = listed_triples(body) if isinstance(body, ImportedBody) else None
+    if listed is None:
+        return {pose_type: grid.evaluation_triples(pose_type) for pose_type in POSE_TYPES}
+    for triple in listed.tolist():
+        _require_in_grid(grid, triple)
+    seen = np.array([grid.pose_type(pose) == "seen" for pose in listed[:, 1]], bool)
+    return {"seen": listed[seen], "unseen": listed[~seen]}
+
+
+def _require_in_grid(grid: Grid, triple: list[int]) -> None:
+    source, source_pose, target, target_pose = triple
+    for identity, pose in ((source, source_pose), (target, target_pose), (target, source_pose)):
+        if identity >= grid.identity_count or pose not in grid.poses_of(identity):
+            raise BodyError(
+                f"the test list uses identity {identity} in pose {pose}, which the dataset will not hold. Take more: "
+                "--set data.identities.evaluation=... data.poses.unseen=..."
+            )
 
 
 def read_test_list(path: str | Path, meshes: FoundMeshes) -> NDArray[np.int32]:

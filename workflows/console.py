@@ -80,6 +80,11 @@ def add_recipe_options(made: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE|X.zarr",
         help=f"a YAML file, or the recipe that a dataset was made by, or one of {names}",
     )
+    add_set_option(made)
+
+
+def add_set_option(made: argparse.ArgumentParser) -> None:
+    """--set."""
     made.add_argument(
         "--set",
         action="extend",

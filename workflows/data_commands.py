@@ -4,12 +4,14 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from datagen.errors import DatasetError, RecipeError
+from datagen.exporters import ExportLayout
+from datagen.layouts import Layout
 from workflows.commands import add_command, print_facts
-from workflows.console import add_recipe_options
-from workflows.recipe import load_recipe
+from workflows.console import add_recipe_options, add_set_option
+from workflows.recipe import change_recipe, load_recipe, override_values, recipe_faults
 
 
 def generate_command(options: argparse.Namespace) -> None:
@@ -73,6 +75,40 @@ def verify_command(options: argparse.Namespace) -> None:
     print(f"{options.dataset} is whole again")
 
 
+def import_command(options: argparse.Namespace) -> None:
+    """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset."""
+    from datagen.generate import generate
+    from datagen.importers import found_recipe
+
+    of_body = override_values(options.set).get("data", {}).get("body", {})
+    with recipe_faults(f"import {options.layout}"):
+        found = found_recipe(options.layout, options.folder, **of_body)
+    base = {"data": found.model_dump(mode="json")}
+    recipe = change_recipe(base, options.set, where=f"import {options.layout}").data
+    with _runner(options) as how:
+        generate(recipe, options.out, fresh=options.fresh, **how)
+    _show(options.out)
+
+
+def export_command(options: argparse.Namespace) -> None:
+    """Write a dataset's meshes as files: NPT's layout for peers' code, or GLB, OBJ, PLY for people."""
+    from datagen.exporters import export_dataset
+    from datagen.store import open_dataset
+    from workflows.progress import bar
+
+    written = export_dataset(
+        open_dataset(options.dataset),
+        options.out,
+        layout=options.layout,
+        identities=options.identities,
+        poses=options.poses,
+        prefix=options.prefix,
+        fresh=options.fresh,
+        progress=lambda cells: bar(cells, total=len(cells), what="export", unit="mesh"),
+    )
+    print(f"{options.out}: {written} files written")
+
+
 @contextmanager
 def _runner(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Where tasks run (--local: here; otherwise on Ray) and what shows their progress."""
@@ -105,6 +141,12 @@ _EXAMPLES = {
     inspect_command: """\
   dsffnet inspect data/quickstart.zarr
   dsffnet inspect data/quickstart.zarr --picture sheet.png""",
+    import_command: """\
+  dsffnet import faust FAUST/training/registrations --out data/faust.zarr
+  dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
+    export_command: """\
+  dsffnet export data/quickstart.zarr --layout npt-obj --out exported
+  dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
     verify_command: """\
   dsffnet verify data/quickstart.zarr
   dsffnet verify data/quickstart.zarr --repair""",
@@ -136,6 +178,22 @@ def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentPar
     verify = add_command(commands, verify_command, _EXAMPLES[verify_command])
     verify.add_argument("dataset", metavar="X.zarr")
     verify.add_argument("--repair", action="store_true", help="make faulty or missing shards again")
+
+    take = add_command(commands, import_command, _EXAMPLES[import_command])
+    take.add_argument("layout", choices=get_args(Layout), help="how the files lie (docs/importing.md)")
+    take.add_argument("folder", metavar="FOLDER", help="where they are")
+    _add_making(take)
+    take.add_argument("--fresh", action="store_true", help="remove what is there first")
+    add_set_option(take)
+
+    export = add_command(commands, export_command, _EXAMPLES[export_command])
+    export.add_argument("dataset", metavar="X.zarr")
+    export.add_argument("--layout", choices=get_args(ExportLayout), required=True, help="see docs/importing.md")
+    export.add_argument("--out", required=True, metavar="FOLDER", help="where the files go")
+    export.add_argument("--identities", type=int, nargs="+", metavar="I", help="these only")
+    export.add_argument("--poses", type=int, nargs="+", metavar="P", help="these only")
+    export.add_argument("--prefix", default="", help="before the numbers in npt-*: id or toy_ for 3D-CoreNet's loaders")
+    export.add_argument("--fresh", action="store_true", help="write files anew that are there")
 
 
 def _add_making(parser: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 import difflib
 import textwrap
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -32,32 +33,70 @@ def known_recipes() -> dict[str, Path]:
 
 
 def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRecipe:
-    """Read a recipe by name or file, apply overrides ``section.key=value``, and check all of it.
+    """Read a recipe by name or file, or from a dataset, apply overrides ``section.key=value``, and check all of it.
 
     Raises
     ------
     RecipeError
         No such recipe, not YAML, an unknown key (the nearest one is named), or a value that cannot be.
     """
+    return change_recipe(_find(name_or_file), overrides, where=str(name_or_file))
+
+
+def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, where: str) -> WorkflowRecipe:
+    """A recipe from a file or from values, with overrides; the errors are those of :func:`load_recipe`."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-    path = _find(name_or_file)
+    try:
+        config = OmegaConf.load(base) if isinstance(base, Path) else OmegaConf.create(base)
+        changes = OmegaConf.create(override_values(overrides))
+        for section, kind in _KINDS:
+            chosen = OmegaConf.select(changes, f"{section}.{kind}")
+            if chosen is not None and chosen != OmegaConf.select(config, f"{section}.{kind}"):
+                OmegaConf.update(config, section, {}, merge=False)  # the keys of another kind would not fit it
+        values = OmegaConf.to_container(OmegaConf.merge(config, changes), resolve=True)
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
+        raise RecipeError(f"recipe {where} cannot be read: {_first_line(error)}") from error
+    return check_recipe(_with_absolute_paths(values), where=where)
+
+
+def override_values(overrides: Sequence[str]) -> dict[str, Any]:
+    """Nested values of ``section.key=value`` words.
+
+    Raises
+    ------
+    RecipeError
+        A word is not of that form.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
     for override in overrides:
         if "=" not in override:
             raise RecipeError(f"--set {override!r} is not of the form section.key=value, e.g. --set training.steps=100")
     try:
-        base = OmegaConf.load(path) if isinstance(path, Path) else OmegaConf.create(path)
-        changes = OmegaConf.from_dotlist(list(overrides))
-        for section, kind in _KINDS:
-            chosen = OmegaConf.select(changes, f"{section}.{kind}")
-            if chosen is not None and chosen != OmegaConf.select(base, f"{section}.{kind}"):
-                OmegaConf.update(base, section, {}, merge=False)  # the keys of another kind would not fit it
-        values = OmegaConf.to_container(OmegaConf.merge(base, changes), resolve=True)
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
-        raise RecipeError(f"recipe {name_or_file} cannot be read: {_first_line(error)}") from error
-    return check_recipe(values, where=str(name_or_file))
+        return dict(OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides))))
+    except (OmegaConfBaseException, YAMLError, ValueError, TypeError) as error:
+        raise RecipeError(f"--set {' '.join(overrides)} cannot be read: {_first_line(error)}") from error
+
+
+_PATHS = {"path", "families", "test_list"}
+
+
+def _with_absolute_paths(values: Any) -> Any:
+    """The same with absolute paths of files that are there: tasks on a cluster run in other folders."""
+    if isinstance(values, dict):
+        return {
+            key: _absolute(value) if key in _PATHS else _with_absolute_paths(value) for key, value in values.items()
+        }
+    return [_with_absolute_paths(value) for value in values] if isinstance(values, list) else values
+
+
+def _absolute(value: Any) -> Any:
+    return str(Path(value).resolve()) if isinstance(value, str) and value and Path(value).exists() else value
 
 
 def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
@@ -70,8 +109,15 @@ def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
     """
     if not isinstance(values, dict) or not values:
         raise RecipeError(f"recipe {where} is not a mapping of sections (data, training, evaluation), or is empty")
-    try:
+    with recipe_faults(where):
         return WorkflowRecipe.model_validate(values)
+
+
+@contextmanager
+def recipe_faults(where: str) -> Iterator[None]:
+    """Turn a failed validation into one line a fault: which key, what is wrong, what was given."""
+    try:
+        yield
     except ValidationError as error:
         faults = "; ".join(_describe(fault) for fault in error.errors())
         raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help") from error

@@ -1,8 +1,11 @@
 """Several bodies in one dataset, so that a triple may take its source from one and its target from another."""
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.assets import Asset
 from datagen.bodies import BodyModel, load_body
 from datagen.poses import Poses
 from datagen.recipe import MixedBody
@@ -24,7 +27,11 @@ class MixedModel:
         )
         common = set.intersection(*(set(body.joints) for body in self._bodies))
         self.joints = tuple(joint for joint in self._bodies[0].joints if joint in common)
-        self.assets = tuple(dict.fromkeys(asset for body in self._bodies for asset in body.assets))
+
+    @cached_property
+    def assets(self) -> tuple[Asset, ...]:
+        """Those of all bodies; found when asked for, as a large set of files takes time to hash."""
+        return tuple(dict.fromkeys(asset for body in self._bodies for asset in body.assets))
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters of the identity's own body in their place."""

@@ -93,13 +93,18 @@ def describe(url: str) -> dict[str, Any]:
         "meshes": f"{grid.mesh_count:,} of {_vertex_counts(group, grid)} vertices",
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
         "extent": _extent(attributes),
-        "evaluation triples": ", ".join(f"{len(grid.evaluation_triples(kind))} {kind}" for kind in POSE_TYPES),
+        "evaluation triples": ", ".join(f"{_triples(group, kind)} {kind}" for kind in POSE_TYPES),
         "assets": "; ".join(f"{a['name']} {a['version']} ({a['licence']})" for a in attributes["body"]["assets"]),
         "packages": ", ".join(f"{name} {version}" for name, version in attributes["provenance"]["packages"].items()),
         "git commit": attributes["provenance"]["git_commit"],
         "recipe sha256": attributes["recipe_sha256"],
     }
     return {name: fact for name, fact in facts.items() if fact}
+
+
+def _triples(group: zarr.Group, pose_type: str) -> int:
+    path = f"evaluation/{pose_type}"
+    return int(array_at(group, path).shape[0]) if path in group else 0
 
 
 def _count(numbers: list[int]) -> str:

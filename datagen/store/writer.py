@@ -22,6 +22,7 @@ from zarr.errors import ContainsArrayError
 from datagen.bodies import BodyModel
 from datagen.errors import DatasetError, StorageError
 from datagen.grid import POSE_TYPES, Grid, Shard
+from datagen.importers import evaluation_lists
 from datagen.mesh import bounds
 from datagen.poses import draw_poses, load_poses
 from datagen.random import Stream, generator
@@ -191,8 +192,8 @@ def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) ->
         group.require_group(name)
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
-    for pose_type in POSE_TYPES:
-        _put(group, f"evaluation/{pose_type}", grid.evaluation_triples(pose_type), ("triple", "column"))
+    for pose_type, triples in evaluation_lists(grid).items():
+        _put(group, f"evaluation/{pose_type}", triples, ("triple", "column"))
     topologies: dict[bytes, str] = {}
     for identity in range(grid.identity_count):
         parameters = identity_parameters(recipe, body, identity)
