@@ -29,11 +29,13 @@ class PhenotypeRanges(Frozen):
     """Uniform ranges from which an Anny identity is drawn; each phenotype lies in [0, 1]."""
 
     gender: Range = Field((0.0, 1.0), description="0 male, 1 female")
-    age: Range = Field((0.5, 1.0), description="0 baby, 1/3 child, 2/3 young adult, 1 old; default: adults")
+    age: Range = Field(
+        (0.5, 1.0), description="0 baby, 1/3 child, 2/3 young adult, 1 old; default: adolescents and adults"
+    )
     muscle: Range = Field((0.0, 1.0), description="0 slight, 1 muscular")
     weight: Range = Field((0.0, 1.0), description="0 thin, 1 heavy")
     height: Range = Field((0.0, 1.0), description="0 short, 1 tall")
-    proportions: Range = Field((0.0, 1.0), description="0 uncommon, 1 ideal body proportions")
+    proportions: Range = Field((0.0, 1.0), description="0 ideal, 1 uncommon body proportions")
 
     @model_validator(mode="after")
     def _ordered_within_unit_interval(self) -> "PhenotypeRanges":
@@ -69,7 +71,10 @@ class AnnyBody(Frozen):
         "height and weight, from Anny's calibrated distribution, within the ranges",
     )
     local_changes: float = Field(
-        0.0, ge=0, le=1, description="strength of Anny's local shape changes (nose, hips, hands ...); 0: none"
+        0.0,
+        ge=0,
+        le=1,
+        description="strength of Anny's 254 local shape changes (nose, hips ...), uniform within +- this; 0: none",
     )
 
 
