@@ -106,13 +106,24 @@ class SmalBody(Frozen):
 
 
 class RiggedBody(Frozen):
-    """Rigged glTF characters that share joint names: the twelve CC0 animals, or a folder of .glb files."""
+    """Rigged glTF characters that share joint names: the twelve CC0 animals, or a folder of .glb and .gltf files."""
 
     family: Literal["rigged"] = "rigged"
-    path: str = Field("animals", description="folder of .glb files, or: animals (the twelve CC0 animals, fetched once)")
-    characters: tuple[str, ...] = Field((), description="file names without .glb; empty: all, in alphabetical order")
-    bone_scale: float = Field(0.2, ge=0, lt=0.7, description="bones are scaled by a factor within 1 +- this")
-    height: float = Field(0.0, ge=0, description="metres from feet to highest point at rest; 0: as in the file")
+    path: str = Field(
+        "animals",
+        description="folder of .glb and .gltf files, or: animals (the twelve CC0 animals, fetched once). Not part of "
+        "the dataset's identity: the files' hashes are",
+    )
+    characters: tuple[str, ...] = Field((), description="file names without ending; empty: all, in alphabetical order")
+    bone_scale: float = Field(
+        0.2,
+        ge=0,
+        le=0.5,
+        description="length and girth of neck, torso, limbs ... are scaled by factors within 1 +- this",
+    )
+    height: float = Field(
+        0.0, ge=0, description="metres from feet to highest point at rest, before parts are scaled; 0: as in the file"
+    )
 
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -206,9 +217,11 @@ class ClipPoses(Frozen):
     """Moments of the animation clips of rigged glTF characters, over the joints that the characters share."""
 
     name: Literal["clips"] = "clips"
-    path: str = Field("animals", description="folder of .glb files, or: animals")
+    path: str = Field("animals", description="folder of .glb and .gltf files, or: animals")
     characters: tuple[str, ...] = Field((), description="whose clips; empty: of all")
-    clips: tuple[str, ...] = Field((), description="patterns of clip names, such as Gallop*; empty: all clips")
+    clips: tuple[str, ...] = Field(
+        (), description="patterns of clip names, such as gallop*, whatever their case; empty: all"
+    )
     held_out: tuple[str, ...] = Field((), description="patterns of clips that only unseen poses are taken from")
     jitter: float = Field(
         0.0, ge=0, description="degrees: every joint is turned further by axis-angle components within +- this"

@@ -1,0 +1,16 @@
+"""The CC0 animals for tests that want the real ones."""
+
+from pathlib import Path
+
+import pytest
+
+from datagen.animals import animal_files
+from datagen.errors import DsffnetError
+
+
+def require_animals() -> Path:
+    """Their folder; the test is skipped where they are neither cached nor to be had."""
+    try:
+        return animal_files()
+    except DsffnetError as error:
+        pytest.skip(f"no animals: {error}")
