@@ -189,7 +189,14 @@ def _grown(url: str, recipe: DatasetRecipe, totals: dict[str, int | None]) -> Da
                 f"{url} has {present[name]} {name}, more than {totals[name]}; appending does not take away. "
                 "Name a larger total, or make a new dataset with dsffnet generate"
             )
-    return recipe.model_copy(update={"growth": (*recipe.growth, Growth(**more))}) if any(more.values()) else recipe
+    if not any(more.values()):
+        return recipe
+    if more.get("seen") and getattr(recipe.poses.distribution, "held_out", None):
+        raise DatasetError(
+            f"{url} holds out some of its motions for unseen poses, and a pose that is appended as seen could not be "
+            "told from them. Append unseen poses only, or make a new dataset with dsffnet generate"
+        )
+    return recipe.model_copy(update={"growth": (*recipe.growth, Growth(**more))})
 
 
 def _complete(url: str, recipe: DatasetRecipe) -> bool:
