@@ -101,6 +101,7 @@ def read_model(path: Path) -> ModelFile:
     try:
         numbers = {key: np.asarray(arrays[key], np.float64) for key in KEYS[:5]}
         table, faces = (np.asarray(arrays[key]).astype(np.int64) for key in KEYS[5:])
+        note = str(arrays.get(NOTE, ""))
     except (ValueError, TypeError) as error:
         raise BodyError(f"{path} is no body model: its arrays are not numbers ({error})") from error
     _check(path, numbers, table, faces)
@@ -113,7 +114,7 @@ def read_model(path: Path) -> ModelFile:
         weights=numbers["weights"],
         parents=_tree(path, table),
         faces=faces.astype(np.int32),
-        note=str(arrays.get(NOTE, "")),
+        note=note,
     )
 
 

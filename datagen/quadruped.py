@@ -45,7 +45,7 @@ _RADII = {
 """Radius of each bone at its joint and at its end, in metres; the right side mirrors the left."""
 
 _ALONG = {"root": "pelvis0", "spine3": "Neck", "Neck": "Head"}  # where a joint with several children points
-_CELL, _MELT, _SOFTNESS, _FAINTEST = 0.025, 0.012, 0.02, 0.02
+_CELL, _MELT, _SOFTNESS, _FAINTEST = 0.023, 0.012, 0.02, 0.02
 _REGIONS = {
     "trunk": ("root", "pelvis0", "spine", "spine0", "spine1", "spine2", "spine3"),
     "legs": ("Leg1", "Leg2", "Leg3", "Foot", "LegBack1", "LegBack2", "LegBack3", "FootBack"),

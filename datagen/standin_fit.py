@@ -14,14 +14,14 @@ _SUM_TO_ONE = 30.0  # how much the condition counts, against distances in metres
 def principal_shapes(bodies: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean [vertex, 3] and principal directions [vertex, 3, count] of bodies [body, vertex, 3], in metres.
 
-    A direction is what one standard deviation along it moves; its largest component is positive.
+    A direction is what one standard deviation along it moves; the first body lies on its positive side. (The sign of
+    its largest component would not do: symmetric bodies have two of equal size.)
     """
     mean = bodies.mean(axis=0)
     spread = (bodies - mean).reshape(len(bodies), -1)
-    _, lengths, axes = np.linalg.svd(spread, full_matrices=False)
+    scores, lengths, axes = np.linalg.svd(spread, full_matrices=False)
     directions = (axes * (lengths / np.sqrt(len(bodies) - 1))[:, None])[:count]
-    signs = np.sign(directions[np.arange(len(directions)), np.abs(directions).argmax(axis=1)])
-    shaped = (directions * signs[:, None]).T.reshape(*mean.shape, -1)
+    shaped = (directions * np.sign(scores[0, :count, None])).T.reshape(*mean.shape, -1)
     return on_grid(mean, _METRES), on_grid(shaped, _DIRECTIONS)
 
 
@@ -52,5 +52,5 @@ def _convex_fit(points: NDArray[np.float64], target: NDArray[np.float64]) -> NDA
 
 
 def on_grid(values: NDArray[np.float64], per_unit: float) -> NDArray[np.float64]:
-    """Values rounded to multiples of ``1 / per_unit``."""
-    return np.round(values * per_unit) / per_unit
+    """Values rounded to multiples of ``1 / per_unit``; none is minus zero, which is equal but other bytes."""
+    return np.round(values * per_unit) / per_unit + 0.0

@@ -31,8 +31,15 @@ from datagen.standin_fit import fit_regressor, principal_shapes
 Kind = Literal["smpl", "smplh", "smplx", "smal"]
 
 _PEOPLE, _SHAPES, _EXPRESSIONS = 200, 10, 10
-_ADULTS = PhenotypeRanges(age=(0.6, 0.9), height=(0.4, 0.6))
-"""Statures of 1.82 +- 0.075 m: SMPL's first direction moves about as much, so that betas of +-4 still look human."""
+_ADULTS = PhenotypeRanges(
+    gender=(0.2, 0.8),
+    age=(0.6, 0.9),
+    muscle=(0.25, 0.75),
+    weight=(0.25, 0.75),
+    height=(0.4, 0.6),
+    proportions=(0.2, 0.8),
+)
+"""Narrow, as betas of +-4 standard deviations, which NPT draws, are to look human: statures are 1.82 +- 0.07 m."""
 
 _ANIMALS, _ANIMAL_SHAPES = 300, 41
 _BONES = (
@@ -93,7 +100,8 @@ def _person(kind: Kind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
     carried = _by_joint(names)
     joints = np.stack([heads[:, _pivots(name, carried[name])].mean(axis=1) for name in names], axis=1)
     bone_weights = scipy.sparse.csr_array(body._rest(_identity(body, 0)).weights).toarray()
-    weights = np.stack([bone_weights[:, carried[name]].sum(axis=1) for name in names], axis=1)
+    weights = np.stack([bone_weights[:, carried[name]].clip(0).sum(axis=1) for name in names], axis=1)
+    faces = body.faces(_identity(body, 0))
     template, shapes = principal_shapes(vertices, _SHAPES)
     if kind == "smplx":
         shapes = np.concatenate([shapes, np.zeros((*template.shape, _EXPRESSIONS))], axis=-1)
@@ -101,7 +109,7 @@ def _person(kind: Kind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
         f"NOT the licensed model: a stand-in for {FAMILIES[kind].title} made from Anny by dsffnet; "
         "code Apache-2.0, assets CC0-1.0"
     )
-    return _layout(template, shapes, fit_regressor(vertices, joints), weights, _tree(names), body._faces, note)
+    return _layout(template, shapes, fit_regressor(vertices, joints), weights, _tree(names), faces, note)
 
 
 def _animal() -> dict[str, NDArray[Any]]:

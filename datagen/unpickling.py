@@ -28,6 +28,7 @@ _GLOBALS = re.compile(
     r"|(?P<sparse>scipy\.sparse(?:\.\w+)*\.(?:csc|csr|coo)_(?:matrix|array))"
     r"|(?P<set>(?:builtins|__builtin__)\.set)"
     r"|(?P<object>(?:builtins|__builtin__)\.object)"
+    r"|(?P<bytes>(?:builtins|__builtin__)\.bytes)"
     r"|(?P<encode>_codecs\.encode)"
     r"|(?P<instance>(?:copyreg|copy_reg)\._reconstructor)"
     r"|(?P<chumpy>chumpy(?:\.\w+)*)",
@@ -189,6 +190,8 @@ def _dtype(value: Any) -> np.dtype[Any]:
 def _bytes(value: Any) -> bytes | bytearray:
     if isinstance(value, Recorded) and value.kind == "encode" and value.arguments[1:] in ((), ("latin1",)):
         value = value.arguments[0]
+    if isinstance(value, Recorded) and value.kind == "bytes" and not value.arguments:
+        return b""  # as Python 3 writes it for Python 2
     if isinstance(value, str):
         return value.encode("latin1")
     if isinstance(value, (bytes, bytearray)):
