@@ -1,0 +1,381 @@
+"""SMPL, SMPL-H and SMPL-X: equal to the reference implementation, and clear about files."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import smplx
+import torch
+from scipy.spatial.transform import Rotation
+from smplx.utils import Struct
+from threadpoolctl import threadpool_limits
+
+from datagen.bodies import load_body
+from datagen.bodies.layout import LayoutBody
+from datagen.bodies.smpl import SmplModel, joint_names
+from datagen.errors import BodyError
+from datagen.model_files import KEYS, convert_model, read_model
+from datagen.model_search import FOLDER_VARIABLE, find_model
+from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
+from datagen.random import Stream, generator
+from datagen.recipe import AnnyBody, MixedBody, PoseRecipe, RangePoses, SmplBody
+from datagen.standins import standin, write_standin
+from tests.support.models import Arrays, random_model, reference, save_npz, save_pickle
+
+MODELS = ("smpl", "smplh", "smplx")
+TOLERANCE = 2e-6  # metres
+NPT = draw_poses(PoseRecipe(), range(40))
+
+
+def tree(model: str) -> tuple[int, ...]:
+    """Parents in SMPL's, SMPL-H's and SMPL-X' files."""
+    hands = {"smpl": [], "smplh": [(20, 22), (21, 37)], "smplx": [(20, 25), (21, 40)]}[model]
+    parents = [*PARENTS[:22], *([15, 15, 15] if model == "smplx" else [])]
+    for wrist, first in hands:
+        parents += [parent for n in range(first, first + 15, 3) for parent in (wrist, n, n + 1)]
+    return tuple(parents) if hands else PARENTS
+
+
+def arrays_of(model: str) -> Arrays:
+    return random_model(tree(model), betas=20 if model == "smplx" else 10)
+
+
+def random_poses(model: str, *, count: int = 40, degrees: float = 30) -> Poses:
+    names = joint_names(model)
+    rotations = np.radians(np.random.default_rng(1).uniform(-degrees, degrees, (count, len(names), 3)))
+    return Poses(names, tree(model), rotations)
+
+
+@pytest.fixture(scope="session")
+def stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with stand-ins under the models' own file names."""
+    folder = tmp_path_factory.mktemp("models")
+    for model in MODELS:
+        write_standin(model, folder / model / f"{model.upper()}_NEUTRAL.npz", topology="notoes_collapse5pc")
+    return folder
+
+
+@pytest.mark.parametrize(("degrees", "tolerance"), [(30, TOLERANCE), (90, 2 * TOLERANCE)])
+@pytest.mark.parametrize("model", MODELS)
+def test_equals_the_reference_implementation(model: str, degrees: float, tolerance: float, tmp_path: Path) -> None:
+    """smplx.lbs.lbs in float64, with shape and pose blend shapes, for random rotations of every joint.
+
+    What differs is the micrometre that skinning rounds joints to, which large turns along a chain add up.
+    """
+    path = save_npz(tmp_path / "model.npz", arrays_of(model))
+    body, poses = SmplModel(SmplBody(model=model, path=str(path))), random_poses(model, degrees=degrees)
+    betas = body.draw_identity(generator(3, Stream.IDENTITY, 0), 0)
+    expected = reference(arrays_of(model), betas, poses.rotations)
+    still = reference({**arrays_of(model), "posedirs": arrays_of(model)["posedirs"] * 0}, betas, poses.rotations)
+    assert np.abs(expected - still).max() > 0.02, "the pose blend shapes matter"
+    assert np.abs(body.vertices(betas, poses) - expected).max() < tolerance
+
+
+def test_equals_smplx_own_smpl_class(tmp_path: Path) -> None:
+    """The SMPL class itself, on the stand-in with pose blend shapes added."""
+    arrays = standin("smpl", topology="notoes_collapse3pc")
+    arrays["posedirs"] = np.random.default_rng(0).normal(0, 0.004, arrays["posedirs"].shape)
+    vertex_ids = dict.fromkeys([*FACE, *FEET, *TIPS], 0)
+    theirs = smplx.SMPL("", data_struct=Struct(**arrays), vertex_ids=vertex_ids, dtype=torch.float64, batch_size=8)
+    body = SmplModel(SmplBody(path=str(save_npz(tmp_path / "smpl.npz", arrays))))
+    betas, poses = body.draw_identity(generator(0, Stream.IDENTITY, 1), 1), NPT[:8]
+    rotations = torch.from_numpy(poses.rotations)
+    posed = theirs(
+        betas=torch.from_numpy(betas)[None].expand(8, -1),
+        global_orient=rotations[:, :1].reshape(8, -1),
+        body_pose=rotations[:, 1:].reshape(8, -1),
+    )
+    assert np.abs(body.vertices(betas, poses) - posed.vertices.detach().numpy()).max() < TOLERANCE
+
+
+FACE = ("nose", "reye", "leye", "rear", "lear")
+FEET = ("LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel")
+TIPS = tuple(side + finger for side in "lr" for finger in ("thumb", "index", "middle", "ring", "pinky"))
+
+
+def test_equals_smplx_own_smplx_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SMPLX class reads the stand-in once it has the face landmarks and hand components that only SMPL-X uses."""
+    arrays = standin("smplx", topology="notoes_collapse3pc")
+    arrays["posedirs"] = np.random.default_rng(0).normal(0, 0.004, arrays["posedirs"].shape)
+    extra: dict[str, Any] = {"lmk_faces_idx": np.zeros(51, int), "lmk_bary_coords": np.full((51, 3), 1 / 3)}
+    extra |= {f"hands_{part}{side}": np.zeros((45, 45) if part == "components" else 45)
+              for part in ("components", "mean") for side in "lr"}  # fmt: skip
+    path = save_npz(tmp_path / "SMPLX_NEUTRAL.npz", {**arrays, **extra})
+    monkeypatch.setitem(smplx.body_models.VERTEX_IDS, "smplx", dict.fromkeys([*FACE, *FEET, *TIPS], 0))
+    theirs = smplx.SMPLX(str(path), ext="npz", use_pca=False, dtype=torch.float64, batch_size=8)
+    body, poses = SmplModel(SmplBody(model="smplx", path=str(path))), random_poses("smplx", count=8)
+    betas = body.draw_identity(generator(0, Stream.IDENTITY, 1), 1)
+    parts = {"global_orient": 0, "body_pose": 1, "jaw_pose": 22, "leye_pose": 23, "reye_pose": 24,
+             "left_hand_pose": 25, "right_hand_pose": 40, "end": 55}  # fmt: skip
+    ends = [*parts.values()][1:]
+    split = {
+        name: torch.from_numpy(poses.rotations[:, first:end]).reshape(8, -1)
+        for (name, first), end in zip(parts.items(), ends, strict=False)
+    }
+    posed = theirs(betas=torch.from_numpy(betas)[None].expand(8, -1), **split)
+    assert np.abs(body.vertices(betas, poses) - posed.vertices.detach().numpy()).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_joint_names_and_trees_agree(model: str) -> None:
+    """Our names with the package's, whose SMPL-H and SMPL-X trees the stand-ins have."""
+    names, arrays = joint_names(model), standin(model, topology="notoes_collapse3pc")
+    assert len(names) == len(set(names)) == {"smpl": 24, "smplh": 52, "smplx": 55}[model]
+    assert names[:22] == JOINTS[:22] and tuple(arrays["kintree_table"][0]) == tree(model)
+
+
+def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(tmp_path: Path) -> None:
+    """Every sum is exact: any order of the pose blend shapes' and the shapes' terms gives the same bits."""
+    file = read_model(save_npz(tmp_path / "m.npz", arrays_of("smpl")))
+    body, world = LayoutBody(file, betas=10, reach=4), NPT.on(JOINTS, PARENTS)
+    betas = np.random.default_rng(0).uniform(-4, 4, 10)
+    whole = body.vertices(betas, world)
+    with threadpool_limits(1):
+        assert np.array_equal(whole[17], body.vertices(betas, world[17:18])[0])
+    shuffled = np.random.default_rng(1).permutation(10)
+    other = LayoutBody(replace(file, shapedirs=file.shapedirs[..., shuffled]), betas=10, reach=4)
+    assert np.array_equal(whole, other.vertices(betas[shuffled], world))
+    features, terms = np.random.default_rng(2).integers(-(2**20), 2**20, 207) / 2**20, body._posedirs
+    assert terms is not None
+    products = features[:, None] * terms
+    forward, backward = products[0] * 0, products[0] * 0
+    for row in range(207):
+        forward, backward = forward + products[row], backward + products[206 - row]
+    assert np.array_equal(forward, backward) and np.array_equal(forward, features @ terms)
+
+
+def test_pose_blend_shapes_see_rotations_relative_to_the_parent(tmp_path: Path) -> None:
+    """Turning the whole body changes nothing but its direction."""
+    body = SmplModel(SmplBody(path=str(save_npz(tmp_path / "m.npz", arrays_of("smpl")))))
+    betas = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+    bent = NPT.rotations[:2].copy()
+    bent[0, 0], bent[1] = 0, bent[0]
+    bent[1, 0] = [0.0, np.pi / 2, 0.0]
+    straight, around = body.vertices(betas, Poses(JOINTS, PARENTS, bent)).astype(float)
+    quarter = Rotation.from_rotvec(bent[1, 0]).as_matrix()
+    difference = around - straight @ quarter.T
+    assert np.ptp(difference, axis=0).max() < 4e-6, "up to where the pelvis lies"
+
+
+def test_identities_are_npts(stand_ins: Path) -> None:
+    """Uniform within +-4, ten of them, each a function of seed and number."""
+    body = load_body(SmplBody(path=str(stand_ins)))
+    drawn = np.stack([body.draw_identity(generator(0, Stream.IDENTITY, n), n) for n in range(400)])
+    assert body.parameter_names == tuple(f"beta{n}" for n in range(10))
+    assert drawn.min() < -3.9 and drawn.max() > 3.9 and np.abs(drawn).max() <= 4
+    assert np.abs(drawn.std(axis=0) - 8 / np.sqrt(12)).max() < 0.25
+    assert np.array_equal(drawn[7], body.draw_identity(generator(0, Stream.IDENTITY, 7), 7))
+
+
+@pytest.mark.parametrize("model", MODELS[1:])
+def test_smpls_hand_joints_bend_the_four_finger_roots(model: str, stand_ins: Path) -> None:
+    body = SmplModel(SmplBody(model=model, path=str(stand_ins)))
+    rotations = np.zeros((2, 24, 3))
+    rotations[1, JOINTS.index("left_hand"), 2] = -0.8
+    bent = body.vertices(np.zeros(10), Poses(JOINTS, PARENTS, rotations))
+    own = Poses(joint_names(model), tree(model), np.zeros((1, len(joint_names(model)), 3)))
+    for finger in ("index1", "middle1", "ring1", "pinky1"):
+        own.rotations[0, own.joints.index(f"left_{finger}"), 2] = -0.8
+    assert np.array_equal(bent[1], body.vertices(np.zeros(10), own)[0])
+    moved = np.linalg.norm(bent[1] - bent[0], axis=1) > 2e-3  # Anny has one vertex of the other hand at 0.0002
+    assert 10 < moved.sum() < 200 and bent[0][moved, 0].min() > 0.6, "the left hand's fingers and nothing else"
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_pose_draws_alike_on_anny_and_on_the_stand_ins(model: str, stand_ins: Path) -> None:
+    """Vertex by vertex: the stand-in, fitted to an Anny body in the T-pose, stays that body in every NPT pose.
+
+    They differ by what ten shape parameters cannot say in the T-pose, and by where the fitted joints lie.
+    """
+    anny = load_body(AnnyBody(topology="notoes_collapse5pc"))
+    adult = np.array([{"age": 0.7, "height": 0.5}.get(name, 0.5) for name in anny.parameter_names])
+    rest = anny.vertices(adult, Poses(JOINTS, PARENTS, np.zeros((1, 24, 3))))[0]
+    body = SmplModel(SmplBody(model=model, path=str(stand_ins)))
+    arrays = read_model(find_model(str(stand_ins), model=model))
+    directions = arrays.shapedirs[..., :10].reshape(-1, 10)
+    betas = np.linalg.lstsq(directions, (rest - arrays.template).ravel(), rcond=None)[0]
+    apart = np.linalg.norm(anny.vertices(adult, NPT) - body.vertices(betas, NPT), axis=-1)
+    between_poses = np.linalg.norm(np.diff(anny.vertices(adult, NPT), axis=0), axis=-1).mean()
+    assert apart.mean() < 0.0025 and np.quantile(apart, 0.99) < 0.01 and apart.max() < 0.025
+    assert apart.mean() < 0.01 * between_poses
+
+
+def test_people_of_anny_and_smpl_in_one_dataset(stand_ins: Path) -> None:
+    recipe = MixedBody(bodies=(AnnyBody(topology="notoes_collapse3pc"), SmplBody(path=str(stand_ins))))
+    body = load_body(recipe)
+    assert set(JOINTS) <= set(body.joints) and len(body.assets) == 2
+    counts = []
+    for identity in range(4):
+        parameters = body.draw_identity(generator(0, Stream.IDENTITY, identity), identity)
+        vertices, faces = body.vertices(parameters, NPT[:3]), body.faces(parameters)
+        assert np.isfinite(vertices).all() and faces.max() == vertices.shape[1] - 1
+        counts.append(vertices.shape[1])
+    assert counts == [369, 615, 369, 615]
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_pickle_and_its_conversion_give_identical_vertices(protocol: int, tmp_path: Path) -> None:
+    original = save_pickle(
+        tmp_path / "basicModel_neutral_lbs_10_207_0_v1.0.0.pkl", arrays_of("smpl"), protocol=protocol
+    )
+    converted = convert_model(original, tmp_path / "converted" / "smpl.npz")
+    with np.load(converted, allow_pickle=False) as plain:
+        assert set(plain) == set(KEYS)
+        assert all(np.array_equal(plain[key], arrays_of("smpl")[key]) for key in KEYS)
+    bodies = [SmplModel(SmplBody(path=str(path))) for path in (original, converted)]
+    betas = bodies[0].draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+    assert np.array_equal(bodies[0].vertices(betas, NPT), bodies[1].vertices(betas, NPT))
+    again = convert_model(converted, tmp_path / "again.npz")
+    assert again.read_bytes() == converted.read_bytes()
+
+
+def test_conversion_leaves_nothing_half_done(tmp_path: Path) -> None:
+    arrays = arrays_of("smpl")
+    bad = save_pickle(tmp_path / "bad.pkl", {key: arrays[key] for key in KEYS if key != "weights"})
+    for out in (tmp_path / "out.npz", tmp_path / "out.pkl"):
+        with pytest.raises(BodyError):
+            convert_model(bad, out)
+    assert os.listdir(tmp_path) == ["bad.pkl"]
+
+
+FILES = {
+    "smpl": ["SMPL_NEUTRAL.npz", "SMPL_NEUTRAL.pkl", "smpl/models/basicmodel_neutral_lbs_10_207_0_v1.1.0.pkl",
+             "basicModel_neutral_lbs_10_207_0_v1.0.0.pkl", "smpl/neutral/model.npz"],
+    "smplh": ["SMPLH_NEUTRAL.pkl", "smplh/neutral/model.npz", "body_models/smplh/SMPLH_neutral.npz"],
+    "smplx": ["models/smplx/SMPLX_NEUTRAL.npz", "SMPLX_NEUTRAL.pkl"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "file"), [(model, file) for model, files in FILES.items() for file in files])
+def test_files_are_found_under_their_published_names(
+    model: str, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = ["SMPL_FEMALE.npz", "SMPL_MALE.pkl", "smplh/male/model.npz", "SMPLX_MALE.npz", "smal_CVPR2017.pkl",
+              "basicmodel_m_lbs_10_207_0_v1.1.0.pkl", "SMPL_NEUTRAL.txt", "smplx2/female/model.npz"]  # fmt: skip
+    others += [name for other, names in FILES.items() if other != model for name in names]
+    for name in [*others, file]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_model(str(tmp_path), model=model) == tmp_path / file
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    assert find_model(None, model=model) == tmp_path / file
+
+
+def test_genders_and_preferences(tmp_path: Path) -> None:
+    for name in ("basicmodel_m_lbs_10_207_0_v1.1.0.pkl", "basicModel_f_lbs_10_207_0_v1.0.0.pkl", "a/SMPL_FEMALE.npz"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_model(str(tmp_path), model="smpl", gender="male").name == "basicmodel_m_lbs_10_207_0_v1.1.0.pkl"
+    assert find_model(str(tmp_path), model="smpl", gender="female").name == "SMPL_FEMALE.npz", "npz before pickle"
+
+
+def test_missing_files_are_one_helpful_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
+    sites = {"smpl": "smpl.is", "smplh": "mano.is", "smplx": "smpl-x.is"}
+    for model, site in sites.items():
+        for path in (None, str(tmp_path), str(tmp_path / "gone.npz")):
+            with pytest.raises(BodyError) as missing:
+                SmplModel(SmplBody(model=model, path=path, gender="male"))
+            message = str(missing.value)
+            assert f"https://{site}.tue.mpg.de" in message and (path or FOLDER_VARIABLE) in message
+            assert f"{model.upper()}_MALE.npz" in message and "\n" not in message and ". " not in message
+            assert "--recipe anny-paper" in message and f"dsffnet stand-in {model} --out {model}.npz" in message
+
+
+def spoiled(key: str, change: Any) -> Arrays:
+    arrays = {name: array.copy() for name, array in arrays_of("smpl").items()}
+    arrays[key] = change(arrays[key])
+    return arrays
+
+
+def put(index: Any, value: float) -> Any:
+    def change(array: np.ndarray) -> np.ndarray:
+        array[index] = value
+        return array
+
+    return change
+
+
+SPOILED = {
+    "weights missing": (lambda: {k: v for k, v in arrays_of("smpl").items() if k != "weights"}, "no 'weights'"),
+    "flat template": (lambda: spoiled("v_template", np.ravel), r"'v_template' has the shape \[450\]"),
+    "short weights": (lambda: spoiled("weights", lambda w: w[:-1]), r"'weights' has the shape \[149, 24\]"),
+    "other joints": (lambda: spoiled("J_regressor", lambda j: j[:-1]), "'J_regressor' has the shape"),
+    "few posedirs": (lambda: spoiled("posedirs", lambda p: p[..., :-9]), r"'posedirs' has .* \[150, 3, 207\]"),
+    "not finite": (lambda: spoiled("shapedirs", put((3, 1, 2), np.nan)), "'shapedirs' holds .* not finite"),
+    "heavy": (lambda: spoiled("weights", put((5, 0), 1.5)), "'weights' of vertex 5 sum to"),
+    "cycle": (lambda: spoiled("kintree_table", put((0, 4), 7)), "'kintree_table' is no tree, as joint 4"),
+    "second root": (lambda: spoiled("kintree_table", put((0, 9), 2**32 - 1)), "'kintree_table' is no tree, as joint 9"),
+    "face outside": (lambda: spoiled("f", put((0, 0), 150)), "'f' names vertex 150, but the model has 150"),
+    "animal": (lambda: random_model(tuple(range(-1, 32))), "33 joints, but SMPL has 24"),
+    "smplh": (lambda: random_model(tree("smplh")), "52 joints, but SMPL has 24; --set data.body.model=smplh"),
+    "two betas": (lambda: random_model(PARENTS, betas=2), "2 shape parameters.*--set data.body.betas=2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", sorted(SPOILED))
+@pytest.mark.parametrize("save", [save_npz, save_pickle], ids=["npz", "pkl"])
+def test_files_that_are_no_model_are_refused_in_one_sentence(fault: str, save: Any, tmp_path: Path) -> None:
+    make, expected = SPOILED[fault]
+    path = save(tmp_path / "model.file.npz", make())
+    with pytest.raises(BodyError, match=expected) as refusal:
+        SmplModel(SmplBody(path=str(path)))
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x05\x06", b"not a model", b"\x80\x04]."])
+def test_damaged_files_are_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
+    with pytest.raises(BodyError, match=r"SMPL_NEUTRAL\.npz"):
+        SmplModel(SmplBody(path=str(tmp_path)))
+
+
+def test_a_truncated_npz_is_refused(stand_ins: Path, tmp_path: Path) -> None:
+    whole = find_model(str(stand_ins), model="smpl").read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 1
+    for content in (whole[: len(whole) // 2], bytes(damaged)):
+        (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
+        with pytest.raises(BodyError, match="copy or download it again"):
+            SmplModel(SmplBody(path=str(tmp_path)))
+
+
+def test_assets_name_the_licence_and_the_hash(stand_ins: Path, tmp_path: Path) -> None:
+    import hashlib
+
+    path = save_npz(tmp_path / "mine.npz", arrays_of("smpl"))
+    (licensed,) = SmplModel(SmplBody(path=str(path), gender="female")).assets
+    assert licensed.name == "SMPL female" and "non-commercial" in licensed.licence
+    assert licensed.version == "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
+    (free,) = SmplModel(SmplBody(path=str(stand_ins))).assets
+    assert free.licence.startswith("NOT the licensed model") and "CC0" in free.licence
+
+
+def test_smplx_shape_parameters_end_where_expressions_begin(tmp_path: Path) -> None:
+    path = save_npz(tmp_path / "x.npz", random_model(tree("smplx"), betas=400, vertices=20))
+    assert len(SmplModel(SmplBody(model="smplx", path=str(path), betas=300)).parameter_names) == 300
+    with pytest.raises(BodyError, match=r"300 shape parameters, but data\.body\.betas asks for 301"):
+        SmplModel(SmplBody(model="smplx", path=str(path), betas=301))
+
+
+def test_poses_may_name_only_what_the_body_has(stand_ins: Path) -> None:
+    body = SmplModel(SmplBody(model="smplh", path=str(stand_ins)))
+    assert set(JOINTS) < set(body.joints) and "left_thumb3" in body.joints
+    poses = draw_poses(PoseRecipe(distribution=RangePoses(uniform=5)), range(2))
+    assert body.vertices(np.zeros(10), poses).dtype == np.float32
+
+
+@pytest.mark.licensed
+@pytest.mark.parametrize("model", MODELS)
+def test_licensed_files_equal_the_reference(model: str) -> None:
+    """With files of the user's in the folder that DSFFNET_BODY_MODELS names."""
+    path = find_model(None, model=model)
+    body, file = SmplModel(SmplBody(model=model)), read_model(path)
+    betas, poses = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0), random_poses(model, count=4)
+    arrays = {"v_template": file.template, "shapedirs": file.shapedirs, "posedirs": file.posedirs,
+              "J_regressor": file.regressor, "weights": file.weights,
+              "kintree_table": np.array([file.parents, range(len(file.parents))])}  # fmt: skip
+    assert np.abs(body.vertices(betas, poses) - reference(arrays, betas, poses.rotations)).max() < TOLERANCE
