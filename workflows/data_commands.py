@@ -9,6 +9,8 @@ from typing import Any, get_args
 from datagen.errors import DatasetError, RecipeError
 from datagen.exporters import ExportLayout
 from datagen.layouts import Layout
+from datagen.recipe import AnnyTopology
+from datagen.standins import Kind
 from workflows.commands import add_command, print_facts
 from workflows.console import add_recipe_options, add_set_option
 from workflows.recipe import change_recipe, load_recipe, override_values, recipe_faults
@@ -109,6 +111,24 @@ def export_command(options: argparse.Namespace) -> None:
     print(f"{options.out}: {written} files written")
 
 
+def convert_body_command(options: argparse.Namespace) -> None:
+    """Write an original SMPL or SMAL file (a pickle) as plain arrays; nothing in it is executed."""
+    from datagen.model_files import convert_model
+
+    print(f"written: {convert_model(Path(options.model), Path(options.out))}")
+
+
+def stand_in_command(options: argparse.Namespace) -> None:
+    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, to try things out."""
+    from datagen.standins import write_standin
+
+    path = write_standin(options.kind, Path(options.out), topology=options.topology)
+    family = "smal" if options.kind == "smal" else f"smpl data.body.model={options.kind}"
+    print(
+        f"written: {path}. It is not the licensed model. Use it: --set data.body.family={family} data.body.path={path}"
+    )
+
+
 @contextmanager
 def _runner(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Where tasks run (--local: here; otherwise on Ray) and what shows their progress."""
@@ -144,6 +164,11 @@ _EXAMPLES = {
     import_command: """\
   dsffnet import faust FAUST/training/registrations --out data/faust.zarr
   dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
+    convert_body_command: """\
+  dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz""",
+    stand_in_command: """\
+  dsffnet stand-in smpl --out standin.npz
+  dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr""",
     export_command: """\
   dsffnet export data/quickstart.zarr --layout npt-obj --out exported
   dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
@@ -194,6 +219,20 @@ def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentPar
     export.add_argument("--poses", type=int, nargs="+", metavar="P", help="these only")
     export.add_argument("--prefix", default="", help="before the numbers in npt-*: id or toy_ for 3D-CoreNet's loaders")
     export.add_argument("--fresh", action="store_true", help="write files anew that are there")
+
+    convert = add_command(commands, convert_body_command, _EXAMPLES[convert_body_command])
+    convert.add_argument("model", metavar="MODEL", help="the file that came with your licence (.pkl or .npz)")
+    convert.add_argument("--out", required=True, metavar="X.npz", help="where the arrays go")
+
+    stand_in = add_command(commands, stand_in_command, _EXAMPLES[stand_in_command])
+    stand_in.add_argument("kind", choices=get_args(Kind), help="whose layout")
+    stand_in.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
+    stand_in.add_argument(
+        "--topology",
+        default="notoes_collapse10pc",
+        choices=get_args(AnnyTopology),
+        help="of the Anny body it is made from",
+    )
 
 
 def _add_making(parser: argparse.ArgumentParser) -> None:

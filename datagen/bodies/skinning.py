@@ -3,8 +3,8 @@
 Skinning is one sparse product: M [vertex, 4 joint] holds each weight times the vertex' homogeneous rest position,
 and is multiplied with the joints' transforms of all poses at once.
 
-Its numbers are multiples of fixed steps (rest positions and rotations of 2^-20, which is a micrometre, products'
-factors of 2^-24), small enough that float64 holds every product and every sum of them exactly. So the order of
+Its numbers are multiples of fixed steps (rest vertices and rotations of 2^-20, which is a micrometre, joints and the
+factors of products of 2^-24), so that float64 holds every product and every sum of them exactly. Then the order of
 summation does not matter, and the bytes of a shard do not depend on the CPU, the BLAS or the number of threads.
 """
 
@@ -62,7 +62,7 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     """
     scale = _scale(rest)
     coarse, fine = _COARSE / scale, _FINE / scale
-    rest = Rest(_round(rest.vertices, coarse), _round(rest.joints, coarse), rest.weights, rest.parents)
+    rest = Rest(_round(rest.vertices, coarse), _round(rest.joints, fine), rest.weights, rest.parents)
     world = _round(world, _COARSE)
     weights = scipy.sparse.csr_array(rest.weights)
     factors = _factors(rest.vertices, weights, fine)
