@@ -94,12 +94,22 @@ def describe(url: str) -> dict[str, Any]:
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
         "extent": _extent(attributes),
         "evaluation triples": ", ".join(f"{_triples(group, kind)} {kind}" for kind in POSE_TYPES),
-        "assets": "; ".join(f"{a['name']} {a['version']} ({a['licence']})" for a in attributes["body"]["assets"]),
+        "assets": _assets(attributes["body"]["assets"]),
         "packages": ", ".join(f"{name} {version}" for name, version in attributes["provenance"]["packages"].items()),
         "git commit": attributes["provenance"]["git_commit"],
         "recipe sha256": attributes["recipe_sha256"],
     }
     return {name: fact for name, fact in facts.items() if fact}
+
+
+def _assets(assets: list[dict[str, str]]) -> str:
+    """What it was made from, with licences; hashes are cut short, the attributes have them whole."""
+    named: dict[str, list[str]] = {}
+    for asset in assets:
+        version = asset["version"]
+        short = version[:19] if version.startswith("sha256:") else version
+        named.setdefault(asset["licence"], []).append(f"{asset['name']} {short}")
+    return "; ".join(f"{', '.join(names)} ({licence})" for licence, names in named.items())
 
 
 def _triples(group: zarr.Group, pose_type: str) -> int:

@@ -1,8 +1,6 @@
 """The ``dsffnet`` command and the workflow script as a person types them: output, one clear error, exit status."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,35 +8,12 @@ import pytest
 
 from datagen.mesh import Mesh, load_mesh, save_mesh
 from datagen.store import open_dataset
+from tests.support.commands import command, fails
 from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
 from training.trainer import train
 from workflows.console import alone_in
-
-ROOT = Path(__file__).parents[2]
-
-
-def command(*arguments: object, script: str = "dsffnet", **environment: str) -> subprocess.CompletedProcess[str]:
-    start = ["-m", "workflows.cli"] if script == "dsffnet" else [str(ROOT / "workflows" / script)]
-    return subprocess.run(
-        [sys.executable, *start, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=120,
-        env={**os.environ, **environment},
-        check=False,
-    )
-
-
-def fails(result: subprocess.CompletedProcess[str], status: int, *says: str) -> None:
-    """One line on standard error that begins with ``error:``, the status, and no traceback."""
-    assert result.returncode == status, result.stderr
-    errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1 and "Traceback" not in result.stderr, result.stderr
-    for text in says:
-        assert text in errors[0]
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +30,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_every_subcommand_has_help_with_an_example() -> None:
     overview = command("--help").stdout
-    for name in ("generate", "inspect", "verify", "train", "evaluate", "transfer", "sync", "recipe"):
+    for name in (
+        "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
+        "transfer", "sync", "recipe",
+    ):  # fmt: skip
         assert name in overview
         assert f"dsffnet {name} " in command(name, "--help").stdout
     assert "training.learning_rate = 0.001" in command("train", "--help").stdout

@@ -1,0 +1,74 @@
+"""A small recipe of every body family, with poses that it understands; files are made where they are needed."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.standins import write_standin
+from tests.support.meshes import npt_folder
+from tests.support.rigged_files import BOXES, JOINTS, Rig, about
+
+COARSE = "notoes_collapse3pc"
+FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "leg")
+PEOPLE = ("anny", "smpl", "smplh", "smplx", "mixed")
+NPT = {"name": "npt"}
+
+
+def recipe_parts(family: str, folder: Path) -> dict[str, Any]:
+    """``body`` and pose ``distribution`` of a family, as a recipe has them; its files go into ``folder``."""
+    return _MAKERS[family](folder)
+
+
+def _anny(folder: Path) -> dict[str, Any]:
+    return {"body": {"family": "anny", "topology": COARSE}, "distribution": NPT}
+
+
+def _smpl(folder: Path, model: str = "smpl") -> dict[str, Any]:
+    path = write_standin(model, folder / f"{model}.npz", topology=COARSE)  # type: ignore[arg-type]
+    return {"body": {"family": "smpl", "model": model, "path": str(path)}, "distribution": NPT}
+
+
+def _smal(folder: Path) -> dict[str, Any]:
+    path = write_standin("smal", folder / "smal.npz")
+    ranges = {"name": "ranges", "skeleton": "smal", "uniform": 15}
+    return {"body": {"family": "smal", "path": str(path)}, "distribution": ranges}
+
+
+def _rigged(folder: Path) -> dict[str, Any]:
+    """A person whose clip waves a leg, and one with a tail and no clip."""
+    rigs = folder / "rigs"
+    rigs.mkdir(exist_ok=True)
+    person = Rig()
+    person.clips = {"Wave": {"Leg.L": person.keys("Leg.L", [np.eye(3), about("z", 60)], [0.0, 2.0])}}
+    person.save(rigs / "person.glb")
+    tail = ((-0.02, 0.98, -0.6), (0.02, 1.02, -0.1), "Tail1", "Tail1")
+    Rig(joints=JOINTS | {"Tail1": ("Hips", (0.0, 1.0, -0.1))}, boxes=[*BOXES, tail]).save(rigs / "tailed.glb")
+    clips = {"name": "clips", "path": str(rigs), "jitter": 20}
+    return {"body": {"family": "rigged", "path": str(rigs)}, "distribution": clips}
+
+
+def _imported(folder: Path) -> dict[str, Any]:
+    meshes = npt_folder(folder / "meshes", identities=range(6), poses=range(8))
+    return {"body": {"family": "imported", "layout": "npt", "path": str(meshes)}, "distribution": {"name": "found"}}
+
+
+def _mixed(folder: Path) -> dict[str, Any]:
+    return {"body": {"family": "mixed", "bodies": [_anny(folder)["body"], _smpl(folder)["body"]]}, "distribution": NPT}
+
+
+def _leg(folder: Path) -> dict[str, Any]:
+    return {"body": {"family": "leg"}, "distribution": NPT}
+
+
+_MAKERS = {
+    "anny": _anny,
+    "smpl": _smpl,
+    "smplh": lambda folder: _smpl(folder, "smplh"),
+    "smplx": lambda folder: _smpl(folder, "smplx"),
+    "smal": _smal,
+    "rigged": _rigged,
+    "imported": _imported,
+    "mixed": _mixed,
+    "leg": _leg,
+}

@@ -1,0 +1,105 @@
+"""The subcommands that make and move data, as processes: what a person types, sees, and gets as exit status."""
+
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from datagen.store import open_dataset
+from tests.support.commands import command, fails
+from tests.support.files import tree_hash
+
+
+class Hostile:
+    """Pickles as a call of os.system."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (f"touch {self.trace}",)
+
+
+def made(out: Path, *extra: object) -> Path:
+    done = command("generate", "--recipe", "smoke", "--local", "--out", out, *extra)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_append_then_make_it_again_from_its_own_attributes(tmp_path: Path) -> None:
+    data = made(tmp_path / "leg.zarr")
+    grown = command("append", data, "--training", "6", "--unseen", "20", "--local")
+    assert grown.returncode == 0 and "6 (0-3, 7-8) training" in grown.stdout
+    assert "2 training, 8 unseen" in grown.stdout
+    again = command("generate", "--recipe", data, "--out", tmp_path / "again.zarr", "--local")
+    assert again.returncode == 0 and tree_hash(data) == tree_hash(tmp_path / "again.zarr")
+
+
+def test_append_without_or_with_wrong_totals(tmp_path: Path) -> None:
+    data = made(tmp_path / "leg.zarr")
+    fails(command("append", data), 2, "nothing to append")
+    fails(command("append", data, "--training", "1", "--local"), 1, "has 4 training, more than 1")
+    fails(command("append", tmp_path / "none.zarr", "--training", "1", "--local"), 1, "no dataset at")
+
+
+def test_inspect_draws_beside_the_person_unless_told_otherwise(tmp_path: Path) -> None:
+    data = made(tmp_path / "leg.zarr")
+    shown = command("inspect", data, folder=tmp_path)
+    picture = tmp_path / "leg-contact-sheet.png"
+    assert "picture: leg-contact-sheet.png" in shown.stdout and picture.stat().st_size > 10_000
+    assert "identities          4 (0-3) training, 3 (4-6) evaluation" in shown.stdout
+    picture.unlink()
+    assert command("inspect", data, "--picture", "none", folder=tmp_path).returncode == 0 and not picture.exists()
+
+
+def test_export_then_import(tmp_path: Path) -> None:
+    data = made(tmp_path / "leg.zarr")
+    out = command("export", data, "--layout", "npt-obj", "--out", tmp_path / "meshes", "--identities", "4", "5", "6")
+    assert out.returncode == 0 and "files written" in out.stdout
+    back = command(
+        "import", "npt", tmp_path / "meshes", "--out", tmp_path / "back.zarr", "--local",
+        "--set", "data.identities.training=0", "data.identities.evaluation=3",
+        "data.poses.seen=20", "data.poses.unseen=12",
+    )  # fmt: skip
+    assert back.returncode == 0, back.stderr
+    first, second = open_dataset(str(data)), open_dataset(str(tmp_path / "back.zarr"))
+    assert np.array_equal(first.vertices(5), second.vertices(1)) and np.array_equal(first.faces(5), second.faces(1))
+
+
+def test_import_of_what_is_not_there(tmp_path: Path) -> None:
+    fails(
+        command("import", "faust", tmp_path / "none", "--out", tmp_path / "x.zarr", "--local"), 1, "no folder of meshes"
+    )
+    fails(
+        command("import", "npt", tmp_path, "--out", tmp_path / "x.zarr", "--local", "--set", "data.body.upp=z"),
+        2,
+        "unknown key 'upp'",
+    )
+
+
+def test_a_stand_in_is_made_and_used(tmp_path: Path) -> None:
+    file = tmp_path / "smpl.npz"
+    written = command("stand-in", "smpl", "--out", file, "--topology", "notoes_collapse3pc")
+    assert written.returncode == 0 and "It is not the licensed model" in written.stdout
+    small = ["data.identities.training=2", "data.identities.evaluation=2", "data.poses.seen=4", "data.poses.unseen=2"]
+    used = command(
+        "generate", "--recipe", "smpl-paper", "--set", f"data.body.path={file}", *small,
+        "--out", tmp_path / "x.zarr", "--local",
+    )  # fmt: skip
+    assert used.returncode == 0 and "smpl.npz" in used.stdout and "sha256:" in used.stdout
+
+
+def test_without_a_model_file_the_message_says_where_to_get_one(tmp_path: Path) -> None:
+    missing = command("generate", "--recipe", "smpl-paper", "--out", tmp_path / "x.zarr", "--local")
+    fails(missing, 1, "https://smpl.is.tue.mpg.de", "anny-paper", "stand-in")
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def test_a_hostile_pickle_is_refused_by_name(tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps(Hostile(trace)))
+    refused = command("convert-body", tmp_path / "model.pkl", "--out", tmp_path / "model.npz")
+    fails(refused, 1, "system", "model.pkl")
+    assert not trace.exists() and not (tmp_path / "model.npz").exists()
