@@ -1,8 +1,8 @@
 """The typed recipes of training and evaluation."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from datagen.errors import RecipeError
 from datagen.recipe import Frozen
@@ -10,8 +10,8 @@ from datagen.recipe import Frozen
 Widths = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
 
 
-class NetworkRecipe(Frozen):
-    """The network; the defaults are the DSFFNet paper's (9,371,023 parameters)."""
+class DsffnetRecipe(Frozen):
+    """DSFFNet; the defaults are the paper's (9,371,023 parameters)."""
 
     name: Literal["dsffnet"] = Field("dsffnet", description="network, see training.networks")
     encoder_widths: Widths = Field((64, 128, 1024), description="channels of the pose encoder's layers")
@@ -20,12 +20,37 @@ class NetworkRecipe(Frozen):
     target_side: bool = Field(True, description="false: ablation w/o the target side's own branch (paper, Table 3)")
 
     @model_validator(mode="after")
-    def _something_modulates(self) -> "NetworkRecipe":
+    def _something_modulates(self) -> "DsffnetRecipe":
         if not (self.feature_fusion or self.target_side):
             raise ValueError(
                 "feature_fusion and target_side cannot both be false: nothing would be left to modulate by"
             )
         return self
+
+
+class NptRecipe(Frozen):
+    """The baseline NPT; the defaults are its released code's (6,054,941 parameters)."""
+
+    name: Literal["npt"] = Field("npt", description="network, see training.networks")
+    variant: Literal["maxpool", "origin"] = Field(
+        "maxpool",
+        description="maxpool: one pose vector a mesh; origin: one a vertex, source and target paired by index",
+    )
+    encoder_widths: Widths = Field((64, 128, 1024), description="channels of the pose encoder; the decoder's follow")
+
+
+def _with_network_name(values: Any) -> Any:
+    """Recipes that name no network mean DSFFNet."""
+    return {"name": DEFAULT_NETWORK, **values} if isinstance(values, dict) else values
+
+
+DEFAULT_NETWORK = "dsffnet"
+NETWORK_NAMES = ("dsffnet", "npt")
+
+NetworkRecipe = Annotated[
+    Annotated[DsffnetRecipe | NptRecipe, Field(discriminator="name")], BeforeValidator(_with_network_name)
+]
+"""The network of a training: one class a network, told apart by ``name``."""
 
 
 class ScheduleRecipe(Frozen):
@@ -42,7 +67,7 @@ class ScheduleRecipe(Frozen):
 class TrainingRecipe(Frozen):
     """How a network is trained; the defaults are the DSFFNet paper's (section 4.2)."""
 
-    network: NetworkRecipe = Field(default_factory=NetworkRecipe)
+    network: NetworkRecipe = Field(default_factory=DsffnetRecipe)
     edge_weight: float = Field(0.0005, ge=0, description="lambda of the edge-length loss (0: ablation w/o L_edge)")
     batch: int = Field(8, ge=1, description="triples in a step, over all ranks together")
     epochs: int = Field(200, ge=1, description="epochs; one epoch is identities x poses triples")

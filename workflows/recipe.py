@@ -13,7 +13,7 @@ from datagen.bodies import FAMILIES
 from datagen.errors import RecipeError
 from datagen.poses import SOURCES
 from datagen.recipe import DatasetRecipe, Frozen
-from training.recipe import EvaluationRecipe, TrainingRecipe
+from training.recipe import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
 
 _FOLDER = Path(__file__).parent / "recipes"
 
@@ -52,9 +52,9 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     try:
         config = OmegaConf.load(base) if isinstance(base, Path) else OmegaConf.create(base)
         changes = OmegaConf.create(override_values(overrides))
-        for section, kind in _KINDS:
+        for section, kind, default in _KINDS:
             chosen = OmegaConf.select(changes, f"{section}.{kind}")
-            if chosen is not None and chosen != OmegaConf.select(config, f"{section}.{kind}"):
+            if chosen is not None and chosen != OmegaConf.select(config, f"{section}.{kind}", default=default):
                 OmegaConf.update(config, section, {}, merge=False)  # the keys of another kind would not fit it
         values = OmegaConf.to_container(OmegaConf.merge(config, changes), resolve=True)
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
@@ -151,8 +151,12 @@ def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -
             yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
 
 
-_KINDS = (("data.body", "family"), ("data.poses.distribution", "name"))
-"""Sections of which there are several kinds, and the key that says which."""
+_KINDS = (
+    ("data.body", "family", None),
+    ("data.poses.distribution", "name", None),
+    ("training.network", "name", DEFAULT_NETWORK),
+)
+"""Sections of which there are several kinds, the key that says which, and which it is where that key is left out."""
 
 
 def _find(name_or_file: str) -> Path | dict[str, Any]:
@@ -176,9 +180,12 @@ def _describe(fault: Any) -> str:
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
     parts = zip(["", *location], location, strict=False)
-    key = ".".join(part for before, part in parts if not (before in ("body", "distribution") and part in _MEMBERS))
+    key = ".".join(part for before, part in parts if not (before in _UNIONS and part in _MEMBERS))
     if fault["type"] == "extra_forbidden":
-        return f"unknown key {key!r}{_nearest(key, [line.split()[0] for line in describe_fields()])}"
+        known = [line.split()[0] for line in describe_fields()]
+        if key in known:
+            return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
+        return f"unknown key {key!r}{_nearest(key, known)}"
     return f"{key}: {fault['msg']} (given: {fault['input']!r})"
 
 
@@ -200,4 +207,5 @@ def _parts(annotation: Any) -> Iterator[Any]:
             yield from _parts(member)
 
 
-_MEMBERS = {*FAMILIES, *SOURCES}
+_UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
+_MEMBERS = {*FAMILIES, *SOURCES, *NETWORK_NAMES}

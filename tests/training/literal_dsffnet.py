@@ -53,10 +53,13 @@ class LiteralEncoder(nn.Module):
         self.layers = nn.ModuleList(nn.Conv1d(i, o, 1) for i, o in zip([3, *widths], widths, strict=False))
         self.norms = nn.ModuleList(nn.InstanceNorm1d(width) for width in widths)
 
-    def forward(self, source: Tensor) -> Tensor:
+    def features(self, source: Tensor) -> Tensor:
         for layer, norm in zip(self.layers, self.norms, strict=True):
             source = torch.relu(norm(layer(source)))
-        return source.max(dim=2).values
+        return source
+
+    def forward(self, source: Tensor) -> Tensor:
+        return self.features(source).max(dim=2).values
 
 
 class LiteralDecoder(nn.Module):

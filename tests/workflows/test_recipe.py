@@ -64,6 +64,21 @@ def test_mistakes_are_named(overrides: list[str], message: str) -> None:
         load_recipe("quickstart", overrides)
 
 
+def test_a_network_is_chosen_by_name_and_the_keys_of_another_do_not_stay() -> None:
+    chosen = load_recipe("quickstart", ["training.network.name=npt", "training.network.variant=origin"])
+    assert chosen.training.network.model_dump() == {
+        "name": "npt", "variant": "origin", "encoder_widths": (64, 128, 1024),
+    }  # fmt: skip
+    plain = load_recipe("quickstart")
+    assert load_recipe("quickstart", ["training.network.name=dsffnet"]) == plain  # what no name means: nothing changes
+    with pytest.raises(RecipeError, match=r"training.network: .*'nptt'.*'dsffnet', 'npt'"):
+        load_recipe("quickstart", ["training.network.name=nptt"])
+    with pytest.raises(
+        RecipeError, match=r"'training.network.decoder_widths' is a key of another kind of 'training.net"
+    ):
+        load_recipe("quickstart", ["training.network.name=npt", "training.network.decoder_widths=[8,8,8]"])
+
+
 def test_unknown_names_and_files(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="no recipe 'quikstart', did you mean 'quickstart'"):
         load_recipe("quikstart")

@@ -9,9 +9,11 @@ from typing import Any
 from torch import nn
 
 from training.networks.dsffnet import DSFFNet
+from training.networks.npt import NPT
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
     "dsffnet": DSFFNet,
+    "npt": NPT,
 }
 """Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both."""
 

@@ -16,6 +16,7 @@ from training.networks.modulation import (
     pose_probe,
     with_zero_gradients,
 )
+from training.networks.shapes import check_vertices
 
 
 class DSFFNet(nn.Module):
@@ -93,7 +94,7 @@ class DSFFNet(nn.Module):
         ValueError
             If shape or dtype does not fit.
         """
-        _check_mesh("source", source, self.decoder.lift.weight.dtype)
+        check_vertices("source", source, self.decoder.lift.weight.dtype)
         return cast(Tensor, self.encoder(source))
 
     def decode(self, *, latent: Tensor, target: Tensor) -> Tensor:
@@ -104,7 +105,7 @@ class DSFFNet(nn.Module):
         ValueError
             If shapes or dtypes do not fit.
         """
-        _check_mesh("target", target, self.decoder.lift.weight.dtype)
+        check_vertices("target", target, self.decoder.lift.weight.dtype)
         expected = [target.shape[0], self.encoder.last.out_features]
         if list(latent.shape) != expected:
             raise ValueError(f"one pose a target: latent must be {expected}, got {list(latent.shape)}")
@@ -211,11 +212,4 @@ def _check_options(encoder: tuple[int, ...], decoder: tuple[int, ...], feature_f
     if not feature_fusion and not target_side:
         raise ValueError(
             "feature_fusion=False keeps only the target's side, which target_side=False removes: choose one"
-        )
-
-
-def _check_mesh(name: str, mesh: Tensor, dtype: torch.dtype) -> None:
-    if mesh.ndim != 3 or mesh.shape[2] != 3 or mesh.shape[1] < 1 or mesh.dtype != dtype:
-        raise ValueError(
-            f"{name} must be a {dtype} tensor of shape [batch, vertex, 3], got {mesh.dtype} of shape {list(mesh.shape)}"
         )

@@ -38,12 +38,23 @@ class PoseEncoder(nn.Module):
 
     def forward(self, source: Tensor) -> Tensor:
         """Return ``[b, widths[-1]]`` for ``[b, n, 3]``."""
-        *weights, last = [layer.weight for layer in self.linear_layers()]
+        last = self.last.weight
         with full_precision(source):
-            centred = centred_features(source)
-            for weight in weights:
-                centred = centred_features(torch.relu(centred @ normalised_linear(weight, centred)))
+            centred = self._before_last(source)
             return torch.relu(_largest(last, centred) * deviation_after(last, centred))
+
+    def features(self, source: Tensor) -> Tensor:
+        """Return ``[b, n, widths[-1]]``, of which `forward` is the maximum over the vertices."""
+        with full_precision(source):
+            centred = self._before_last(source)
+            line = normalised_linear(self.last.weight, centred)
+        return torch.relu(centred @ line)
+
+    def _before_last(self, source: Tensor) -> Tensor:
+        centred = centred_features(source)
+        for layer in self.linear_layers()[:-1]:
+            centred = centred_features(torch.relu(centred @ normalised_linear(layer.weight, centred)))
+        return centred
 
 
 def centred_features(features: Tensor) -> Tensor:

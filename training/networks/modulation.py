@@ -66,12 +66,12 @@ class FFAdaIN(nn.Module):
         """Return the maps of scale and shift, ``[b, 4, c]`` each, for the meshes' `probe` (see `pose_probe`)."""
         if not self.fusion:
             size = (probe.shape[0], -1, -1)
-            return _identity_map(self.identity_scale).expand(size), _identity_map(self.identity_shift).expand(size)
-        scale, shift = _mixed_map(self.mixed_scale, probe), _mixed_map(self.mixed_shift, probe)
+            return affine_map(self.identity_scale).expand(size), affine_map(self.identity_shift).expand(size)
+        scale, shift = posed_map(self.mixed_scale, probe), posed_map(self.mixed_shift, probe)
         if not self.target_side:
             return scale, shift
-        scale = torch.lerp(_identity_map(self.identity_scale), scale, self.alpha)
-        return scale, torch.lerp(_identity_map(self.identity_shift), shift, self.beta)
+        scale = torch.lerp(affine_map(self.identity_scale), scale, self.alpha)
+        return scale, torch.lerp(affine_map(self.identity_shift), shift, self.beta)
 
 
 def pose_probe(latent: Tensor) -> Tensor:
@@ -83,15 +83,19 @@ def pose_probe(latent: Tensor) -> Tensor:
     return torch.cat([nn.functional.pad(latent.unsqueeze(1), (0, 0, 3, 0)), unit], dim=2)
 
 
-def _identity_map(layer: nn.Linear) -> Tensor:
+def affine_map(layer: nn.Linear) -> Tensor:
+    """Return a linear layer of a vertex as the ``[4, c]`` map of its homogeneous coordinates."""
     return torch.cat([layer.weight.t(), layer.bias.unsqueeze(0)])
 
 
-def _mixed_map(layer: nn.Linear, probe: Tensor) -> Tensor:
+def posed_map(layer: nn.Linear, probe: Tensor) -> Tensor:
+    """Return a linear layer of ``[z, v]`` as ``[b, 4, c]`` maps of homogeneous coordinates (see `pose_probe`)."""
     return nn.functional.linear(probe, layer.weight) + nn.functional.pad(layer.bias.unsqueeze(0), (0, 0, 3, 0))
 
 
-def modulated_relu(hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+def modulated_relu(
+    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, *, normalised: bool = True
+) -> Tensor:
     """Return ``relu(IN(hidden) * sigma + mu)``.
 
     Parameters
@@ -102,6 +106,8 @@ def modulated_relu(hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tenso
         ``[b, n, 4]`` homogeneous coordinates.
     scale, shift
         ``[b, 4, c]``: ``sigma = vertices @ scale`` and ``mu = vertices @ shift``.
+    normalised
+        False leaves the instance norm out: ``relu(hidden * sigma + mu)``.
 
     Returns
     -------
@@ -111,19 +117,21 @@ def modulated_relu(hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tenso
     hidden = hidden.to(vertices.dtype)
     with full_precision(hidden):
         if not torch.compiler.is_compiling():
-            return cast(Tensor, _ModulatedRelu.apply(hidden, vertices, scale, shift))  # type: ignore[no-untyped-call]
+            return cast(Tensor, _ModulatedRelu.apply(hidden, vertices, scale, shift, normalised))  # type: ignore[no-untyped-call]
         # A compiler fuses the plain expression, and could not unroll an unknown number of chunks.
-        centred = hidden - hidden.mean(dim=1, keepdim=True)
-        deviation = torch.rsqrt(centred.square().mean(dim=1, keepdim=True) + VARIANCE_FLOOR)
-        return torch.relu(centred * (vertices @ (scale * deviation)) + vertices @ shift)
+        if normalised:
+            hidden = hidden - hidden.mean(dim=1, keepdim=True)
+            scale = scale * torch.rsqrt(hidden.square().mean(dim=1, keepdim=True) + VARIANCE_FLOOR)
+        return torch.relu(hidden * (vertices @ scale) + vertices @ shift)
 
 
 class _ModulatedRelu(torch.autograd.Function):
     """Few passes over memory: chunks stay in cache, and sums over vertices are products with four rows."""
 
     @staticmethod
-    def forward(ctx: Any, hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-        mean, deviation = _statistics(hidden)
+    def forward(ctx: Any, hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, normalised: bool) -> Tensor:
+        ctx.normalised = normalised
+        mean, deviation = _statistics(hidden) if normalised else _no_statistics(hidden)
         scaled = scale * deviation
         output, centred, sigma = torch.empty_like(hidden), _scratch(hidden), _scratch(hidden)
         for chunk in _chunks(hidden):
@@ -146,12 +154,13 @@ class _ModulatedRelu(torch.autograd.Function):
             grad_vertices = gradient @ shift.transpose(1, 2) + weighted @ scale.transpose(1, 2)
         # The derivative of an instance norm removes mean(d) and mean(d * IN(h)), d = gradient * sigma. Both are sums of
         # four products: sigma is vertices @ scale, and the sums against the four coordinates are known.
-        along_one = (scale * grad_shift).mean(dim=1, keepdim=True) * (4 / hidden.shape[1]) * deviation
-        along_hidden = (scale * grad_scale).mean(dim=1, keepdim=True) * (4 / hidden.shape[1]) * deviation.square()
+        share = 4 / hidden.shape[1] if ctx.normalised else 0.0
+        along_one = (scale * grad_shift).mean(dim=1, keepdim=True) * share * deviation
+        along_hidden = (scale * grad_scale).mean(dim=1, keepdim=True) * share * deviation.square()
         _normalisation_gradient(
             gradient, hidden, vertices, scale * deviation, mean * along_hidden - along_one, -along_hidden
         )
-        return gradient, grad_vertices, grad_scale, grad_shift
+        return gradient, grad_vertices, grad_scale, grad_shift, None
 
 
 def _statistics(hidden: Tensor) -> tuple[Tensor, Tensor]:
@@ -170,6 +179,12 @@ def _statistics(hidden: Tensor) -> tuple[Tensor, Tensor]:
         squares.baddbmm_(ones[:, :, chunk], centred.square_())
     rest /= count
     return mean + rest, torch.rsqrt(squares / count - rest.square() + VARIANCE_FLOOR)
+
+
+def _no_statistics(hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean and ``1 / sqrt(Var + eps)`` with which nothing is normalised."""
+    zeros = hidden.new_zeros(hidden.shape[0], 1, hidden.shape[2])
+    return zeros, torch.ones_like(zeros)
 
 
 def _masked_sums(

@@ -1,0 +1,207 @@
+"""Weights that the authors released: DSFFNet's and NPT's, in their state_dict layout and in ours.
+
+The released modules are convolutions of kernel 1 (weights ``[c, i, 1]``), ours are linear layers (``[c, i]``). Names
+correspond part by part, see the two tables. Instance norms have neither weights nor statistics.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from training.checkpoint import CheckpointError
+from training.networks.dsffnet import DSFFNet
+from training.networks.npt import NPT
+
+Network = TypeVar("Network", bound=nn.Module)
+Released = str | Path | Mapping[str, Any]
+"""A file of ``torch.save``, or what was in it."""
+
+_SHARED = {
+    "layers": "", "0": "conv1", "1": "conv2", "2": "conv3",
+    "lift": "conv1", "linear1": "conv1", "linear2": "conv2", "linear3": "conv3", "out": "conv4",
+}  # fmt: skip
+_DSFFNET = _SHARED | {f"block{i}": f"testres{i}" for i in (1, 2, 3)} | {
+    "norm1": "test1", "norm2": "test2",
+    "identity_shift": "conv_id1", "identity_scale": "conv_id2", "mixed_shift": "conv_po1", "mixed_scale": "conv_po2",
+}  # fmt: skip
+_NPT = _SHARED | {f"block{i}": f"spadain_block{i}" for i in (1, 2, 3)} | {
+    "norm1": "spadain1", "norm2": "spadain2", "norm_residual": "spadain_res",
+    "scale": "conv_weight", "shift": "conv_bias", "linear_residual": "conv_res",
+}  # fmt: skip
+"""Parts of our parameter names -> parts of the released ones; parts that are not listed are the same."""
+
+_ENCODER = ("encoder.conv1.weight", "encoder.conv2.weight", "encoder.conv3.weight")
+_DECODER = ("decoder.conv1.weight", "decoder.conv2.weight", "decoder.conv3.weight")
+_MOST_NAMED = 6
+
+
+def load_released_dsffnet(released: Released, **options: Any) -> DSFFNet:
+    """Return DSFFNet with released weights (``pt_module.FFAdaINModel``), in evaluation mode.
+
+    Parameters
+    ----------
+    released
+        A file, or its state_dict. Names may begin with ``module.`` (DataParallel); the state_dict may lie under the
+        key ``state_dict``. Pickled code is never run.
+    **options
+        Of `DSFFNet`, for ablations; widths are read from the weights.
+
+    Raises
+    ------
+    CheckpointError
+        Not a checkpoint, or a name is missing, unknown, or of a wrong shape.
+
+    Examples
+    --------
+    >>> network = load_released_dsffnet("saved_models/model_smpl.pth")        # doctest: +SKIP
+    """
+    state = read_released(released)
+    widths = _widths(state, encoder_widths=_ENCODER, decoder_widths=_DECODER)
+    return filled(DSFFNet(**{**widths, **options}), state, _DSFFNET)
+
+
+def load_released_npt(released: Released, *, variant: Literal["maxpool", "origin"]) -> NPT:
+    """Return NPT with released weights, in evaluation mode.
+
+    Parameters
+    ----------
+    released
+        As for `load_released_dsffnet`.
+    variant
+        Which script trained it: ``model_maxpool.py`` or ``model.py`` ("origin", as the authors' own
+        ``original_169.model``). Both have the same names and shapes, so weights do not tell.
+
+    Raises
+    ------
+    CheckpointError
+        Not a checkpoint, or a name is missing, unknown, or of a wrong shape.
+    """
+    state = read_released(released)
+    return filled(NPT(variant=variant, **_widths(state, encoder_widths=_ENCODER)), state, _NPT)
+
+
+def to_released_dsffnet(network: DSFFNet) -> dict[str, Tensor]:
+    """Return the state_dict that the authors' ``FFAdaINModel`` loads."""
+    return _released_state(network, _DSFFNET)
+
+
+def to_released_npt(network: NPT) -> dict[str, Tensor]:
+    """Return the state_dict that the authors' ``NPT`` of the same variant loads."""
+    return _released_state(network, _NPT)
+
+
+def read_released(released: Released) -> dict[str, Tensor]:
+    """Return the state_dict of a file or of what was in it, without wrappings.
+
+    Raises
+    ------
+    CheckpointError
+        If it holds no state_dict.
+    """
+    where = str(released) if isinstance(released, str | Path) else "the given state_dict"
+    state = _load(released) if isinstance(released, str | Path) else released
+    if isinstance(state, Mapping) and isinstance(state.get("state_dict"), Mapping):
+        state = state["state_dict"]
+    if not isinstance(state, Mapping) or not state:
+        raise CheckpointError(f"{where} holds no weights by name, but {_described(state)}")
+    for name, value in state.items():
+        if not isinstance(name, str) or not isinstance(value, Tensor) or not value.is_floating_point():
+            raise CheckpointError(f"{where} is no state_dict of weights: under {name!r} there is {_described(value)}")
+    prefix = "module." if all(name.startswith("module.") for name in state) else ""
+    return {name.removeprefix(prefix): value for name, value in state.items()}
+
+
+def filled(network: Network, state: Mapping[str, Tensor], parts: Mapping[str, str]) -> Network:
+    """Return `network` with weights by their released names, every one of them and no other; in evaluation mode.
+
+    Raises
+    ------
+    CheckpointError
+        Naming what is missing, unknown, or of a wrong shape.
+    """
+    own = network.state_dict()
+    expected = {released_name(name, parts): _released_shape(value) for name, value in own.items()}
+    faults = [*_name_faults(expected, state), *_shape_faults(expected, state)]
+    if faults:
+        raise CheckpointError(f"these weights do not fit {type(network).__name__}: {'; '.join(faults)}")
+    network.load_state_dict(
+        {name: state[released_name(name, parts)].reshape(value.shape) for name, value in own.items()}
+    )
+    return network.eval()
+
+
+def released_name(name: str, parts: Mapping[str, str]) -> str:
+    """Return the released name of one of our parameters.
+
+    >>> released_name("decoder.block2.norm1.mixed_scale.weight", _DSFFNET)
+    'decoder.testres2.test1.conv_po2.weight'
+    """
+    return ".".join(found for part in name.split(".") if (found := parts.get(part, part)))
+
+
+def _load(path: str | Path) -> Any:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise CheckpointError(f"weights {path} cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a file that is no checkpoint can make the reader raise anything
+        refused = re.search(r"GLOBAL (\S+)", str(error))
+        reason = (
+            f"it holds a Python object ({refused[1]}), which is not loaded because that could run code; "
+            "save the module's state_dict() instead"
+            if refused
+            else "it is not a checkpoint of torch.save, or it is damaged"
+        )
+        raise CheckpointError(f"weights {path} cannot be loaded: {reason}") from error
+
+
+def _widths(state: Mapping[str, Tensor], **layers: tuple[str, ...]) -> dict[str, Any]:
+    """Return constructor arguments from the sizes of layers; a missing one leaves the default, and `filled` tells."""
+    return {
+        argument: tuple(state[name].shape[0] for name in names)
+        for argument, names in layers.items()
+        if all(name in state and state[name].ndim and state[name].shape[0] for name in names)
+    }
+
+
+def _released_state(network: nn.Module, parts: Mapping[str, str]) -> dict[str, Tensor]:
+    return {
+        released_name(name, parts): value.reshape(_released_shape(value))
+        for name, value in network.state_dict().items()
+    }
+
+
+def _released_shape(value: Tensor) -> list[int]:
+    return [*value.shape, 1] if value.ndim == 2 else [*value.shape]
+
+
+def _name_faults(expected: Mapping[str, list[int]], state: Mapping[str, Tensor]) -> list[str]:
+    kinds = {
+        "missing": [name for name in expected if name not in state],
+        "unknown": [name for name in state if name not in expected],
+    }
+    return [f"{kind}: {_listed(names)}" for kind, names in kinds.items() if names]
+
+
+def _shape_faults(expected: Mapping[str, list[int]], state: Mapping[str, Tensor]) -> list[str]:
+    wrong = [
+        f"{name} {list(state[name].shape)} instead of {shape}"
+        for name, shape in expected.items()
+        if name in state and list(state[name].shape) != shape
+    ]
+    return [f"wrong shape: {_listed(wrong)}"] if wrong else []
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _described(value: Any) -> str:
+    return f"a tensor of {value.dtype}" if isinstance(value, Tensor) else f"{type(value).__name__}"
