@@ -8,9 +8,11 @@ from typing import Any
 
 from torch import nn
 
+from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
+    "corenet3d": CoreNet3D,
     "dsffnet": DSFFNet,
 }
 """Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both."""
