@@ -110,8 +110,9 @@ class ElaINBlock(nn.Module):
     """``shortcut(f(ElaIN(h))) + linear1(f(ElaIN(linear0(f(ElaIN(h))))))`` with ``f`` a LeakyReLU.
 
     The three linear maps are divided by their largest singular value (spectral norm), estimated by one power iteration
-    a forward pass in training; in evaluation the estimate stays as it is. The shortcut is learned although the
-    channels do not change, and has no bias (released code).
+    a forward pass in training; in evaluation the estimate stays as it is. The released code's older function updates
+    the two singular vectors in the other order, which is the same once they have settled. The shortcut is
+    learned although the channels do not change, and has no bias (released code).
     """
 
     def __init__(self, channels: int, identity: int) -> None:
