@@ -8,10 +8,12 @@ from typing import Any
 
 from torch import nn
 
+from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
+    "corenet3d": CoreNet3D,
     "dsffnet": DSFFNet,
     "npt": NPT,
 }

@@ -1,0 +1,217 @@
+"""3D-CoreNet: pose transfer by correspondence learning and mesh refinement (Song et al., NeurIPS 2021)."""
+
+from __future__ import annotations
+
+import sys
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import is_parametrized
+
+from training.networks.correspondence import transport_matrix, warp
+from training.networks.elain import SLOPE, Generator
+from training.networks.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
+
+INITIAL_GAIN = 0.02
+"""Gain of the initial Xavier normal weights (released code)."""
+
+RESIDUAL_BLOCKS = 4
+"""Residual blocks after the feature layers (released code)."""
+
+
+class Transfer(NamedTuple):
+    """An output of `CoreNet3D` with the correspondence that it was made from."""
+
+    vertices: Tensor
+    """``[b, n_target, 3]``, the output."""
+    warped: Tensor
+    """``[b, n_target, 3]``, the source's vertices moved by `transport`, before the refinement."""
+    transport: Tensor
+    """``[b, n_target, n_source]``, transport matrix with rows divided by their sums."""
+
+
+class CoreNet3D(nn.Module):
+    """Transfer the pose of `source` to `target`, with correspondence learning and refinement by ElaIN.
+
+    Per-vertex features of both meshes (`VertexFeatures`, shared) give cosine similarities, these an optimal transport
+    (`correspondence`), this a warped mesh: the source's vertices in the target's order. The `Generator` refines it,
+    conditioned on the target's features. Output ``2 tanh(...)``. The default widths give 24,461,447 parameters.
+
+    The order of the source's vertices has no effect. That of the target's has: the generator's first convolution is
+    three vertices wide, so a vertex sees its neighbours *in the file's order*. The released code shuffles the vertices
+    of every training and test mesh, so that its neighbours are chance ones; train and evaluate alike.
+
+    A NaN or infinity in a mesh makes all output vertices of its pair NaN (norms spread it), and of no other pair:
+    inputs are not searched, and nothing plausible comes of broken ones.
+
+    Parameters
+    ----------
+    feature_widths
+        Channels after each feature layer; the last is also that of the residual blocks and of the identity feature.
+    generator_widths
+        Channels of the generator's three blocks.
+    centre_features
+        True subtracts from a vertex's feature its mean over the channels before it is scaled to unit length. Some
+        accounts of the method have this; the released code, and so the weights trained with it, do not.
+
+    Notes
+    -----
+    =======================================  ======================================================================
+    parameter                                initial value
+    =======================================  ======================================================================
+    weight, i inputs and o outputs           normal, deviation 0.02 sqrt(2 / (i + o)); i = 9, o = 3c for the lift
+    weight under a spectral norm             uniform in +-1/sqrt(i): released code means the above, but sets a copy
+    bias                                     0
+    slope of a residual block's PReLU        0.25
+    singular vectors of the spectral norm    after 15 power iterations (PyTorch); random in the released code
+    =======================================  ======================================================================
+
+    Trained with Adam, betas (0, 0.9), eps 1e-3, rate 1e-4 for 100 epochs, then falling to zero over another 100, with
+    1000 times the mean squared coordinate error plus 0.5 times the edge loss of NPT (released code).
+
+    What is not computed, and why the result is the same, stands in `correspondence` and `elain`; besides, the
+    generator's first two layers are one map, a block's last is merged with the layer after it, and a bias before an
+    instance norm cancels (its gradient is exactly zero).
+
+    Under autocast only the generator's wide products use the lower precision: the temperature of the transport would
+    magnify an error of a cosine by 33.
+
+    Examples
+    --------
+    >>> network = CoreNet3D(feature_widths=(8, 16, 32), generator_widths=(32, 16, 8))
+    >>> network(source=torch.rand(2, 50, 3), target=torch.rand(2, 40, 3)).shape
+    torch.Size([2, 40, 3])
+    """
+
+    def __init__(
+        self,
+        *,
+        feature_widths: tuple[int, int, int] = (64, 128, 256),
+        generator_widths: tuple[int, int, int] = (1024, 512, 256),
+        centre_features: bool = False,
+    ) -> None:
+        super().__init__()
+        for name, widths in (("feature_widths", feature_widths), ("generator_widths", generator_widths)):
+            if len(widths) != 3 or min(widths) < 1:
+                raise ValueError(f"{name} must be three positive integers, got {widths}")
+        width = feature_widths[-1]
+        self.features = VertexFeatures(tuple(feature_widths), centre_features)
+        self.theta, self.phi = nn.Linear(width, width), nn.Linear(width, width)
+        self.generator = Generator(tuple(generator_widths), width)
+        _initialise(self)
+
+    def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        """Return the target ``[b, n_target, 3]`` in the pose of the source ``[b, n_source, 3]``.
+
+        Both are in normalised coordinates (box centred, half its longest edge = 1) and in the dtype of the parameters.
+
+        Raises
+        ------
+        ValueError
+            If shapes or dtypes do not fit.
+        """
+        identity, theta, phi = self._described(source, target)
+        with full_precision(source):
+            warped = warp(theta, phi, source)
+        return self._refined(warped, identity)
+
+    def forward_with_correspondence(self, *, source: Tensor, target: Tensor) -> Transfer:
+        """Return the same with the warped points and the transport matrix, which is held (twice) in memory.
+
+        Raises
+        ------
+        ValueError
+            If shapes or dtypes do not fit.
+        """
+        identity, theta, phi = self._described(source, target)
+        with full_precision(source):
+            transport = transport_matrix(theta, phi)
+            warped = transport @ source
+        return Transfer(self._refined(warped, identity), warped, transport)
+
+    def _described(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the target's features and both meshes' features of unit length."""
+        _check_meshes(source, target, self.theta.weight.dtype)
+        with full_precision(source):
+            identity = self.features(target)
+            theta, phi = self.theta(identity), self.phi(self.features(source))
+            return identity, unit_length(theta), unit_length(phi)
+
+    def _refined(self, warped: Tensor, identity: Tensor) -> Tensor:
+        return with_zero_gradients(self.generator(warped, identity), self.features.dead_biases())
+
+
+class VertexFeatures(nn.Module):
+    """Features of each vertex in its mesh: three layers, then residual blocks."""
+
+    def __init__(self, widths: tuple[int, ...], centre: bool) -> None:
+        super().__init__()
+        self.centre = centre
+        self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in zip((3, *widths), widths, strict=False))
+        self.blocks = nn.ModuleList(ResidualBlock(widths[-1]) for _ in range(RESIDUAL_BLOCKS))
+
+    def dead_biases(self) -> list[Tensor]:
+        """Return the biases that the norm after their layer cancels."""
+        inner = [layer for block in self.blocks for layer in (block.linear1, block.linear2)]
+        return [cast(nn.Linear, layer).bias for layer in (*self.layers, *inner)]
+
+    def forward(self, vertices: Tensor) -> Tensor:
+        """Return ``[b, n, widths[-1]]`` for ``[b, n, 3]``."""
+        first, *others = (cast(nn.Linear, layer) for layer in self.layers)
+        hidden = _normed_linear(first, vertices)
+        for layer in others:
+            hidden = _normed_linear(layer, nn.functional.leaky_relu(hidden, SLOPE))
+        hidden = unit_length(hidden - hidden.mean(dim=2, keepdim=True) if self.centre else hidden)
+        for block in self.blocks:
+            hidden = block(hidden)
+        return hidden
+
+
+class ResidualBlock(nn.Module):
+    """Linear layer, instance norm, PReLU, linear layer, instance norm; sum with the input; the same PReLU."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.linear1, self.linear2 = nn.Linear(width, width), nn.Linear(width, width)
+        self.activation = nn.PReLU()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return ``[b, n, c]`` for ``[b, n, c]``."""
+        inner = self.activation(_normed_linear(self.linear1, features))
+        return cast(Tensor, self.activation(features + _normed_linear(self.linear2, inner)))
+
+
+def unit_length(features: Tensor) -> Tensor:
+    """Scale features ``[b, n, c]`` to unit length over the channels; zeros stay zeros."""
+    return features / (torch.linalg.vector_norm(features, dim=2, keepdim=True) + sys.float_info.epsilon)
+
+
+def _normed_linear(layer: nn.Linear, features: Tensor) -> Tensor:
+    """Return the instance norm (biased variance) of the layer's output, which its bias does not change."""
+    hidden = nn.functional.linear(features, layer.weight)
+    hidden = hidden - hidden.mean(dim=1, keepdim=True)
+    return hidden * torch.rsqrt(hidden.square().mean(dim=1, keepdim=True) + VARIANCE_FLOOR)
+
+
+def _initialise(network: CoreNet3D) -> None:
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear):
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+            if not is_parametrized(layer, "weight"):
+                nn.init.xavier_normal_(layer.weight, INITIAL_GAIN)
+    lift = network.generator.lift
+    fans = 9 + 3 * lift.out_features  # as PyTorch counts those of a convolution: every place of the kernel has outputs
+    nn.init.normal_(lift.weight, 0.0, INITIAL_GAIN * (2 / fans) ** 0.5)
+
+
+def _check_meshes(source: Tensor, target: Tensor, dtype: torch.dtype) -> None:
+    for name, mesh in (("source", source), ("target", target)):
+        if mesh.ndim != 3 or mesh.shape[2] != 3 or mesh.shape[1] < 1 or mesh.dtype != dtype:
+            found = f"{mesh.dtype} of shape {list(mesh.shape)}"
+            raise ValueError(f"{name} must be a {dtype} tensor of shape [batch, vertex, 3], got {found}")
+    if source.shape[0] != target.shape[0]:
+        raise ValueError(
+            f"source and target must be equally many, got shapes {list(source.shape)} and {list(target.shape)}"
+        )
