@@ -45,10 +45,22 @@ def _with_network_name(values: Any) -> Any:
 
 
 DEFAULT_NETWORK = "dsffnet"
-NETWORK_NAMES = ("dsffnet", "npt")
+
+
+class CoreNet3dRecipe(Frozen):
+    """3D-CoreNet; the defaults are the paper's (24,461,447 parameters)."""
+
+    name: Literal["corenet3d"] = "corenet3d"
+    feature_widths: Widths = Field((64, 128, 256), description="channels of the vertex features' layers")
+    generator_widths: Widths = Field((1024, 512, 256), description="channels of the generator's three blocks")
+    centre_features: bool = Field(False, description="centre features over channels before they are compared")
+
+
+NETWORK_NAMES = ("dsffnet", "npt", "corenet3d")
 
 NetworkRecipe = Annotated[
-    Annotated[DsffnetRecipe | NptRecipe, Field(discriminator="name")], BeforeValidator(_with_network_name)
+    Annotated[DsffnetRecipe | NptRecipe | CoreNet3dRecipe, Field(discriminator="name")],
+    BeforeValidator(_with_network_name),
 ]
 """The network of a training: one class a network, told apart by ``name``."""
 

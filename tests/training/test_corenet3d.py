@@ -110,7 +110,7 @@ def test_float32_output_is_as_exact_as_the_equations_in_float32() -> None:
         fast, literal = network(**inputs), LiteralCoreNet3D(network)(**inputs)
         exact = network.double()(**{name: mesh.double() for name, mesh in inputs.items()})
     assert exact.std() > 0.1
-    assert (fast - literal).abs().max() < 1e-5
+    assert (fast - literal).abs().max() < 2e-5  # rounding of two float32 evaluations, in a box of 2
     assert (fast - exact).abs().max() < 1e-5 + 2 * (literal - exact).abs().max()
 
 
