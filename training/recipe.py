@@ -91,6 +91,9 @@ class TrainingRecipe(Frozen):
     seed: int = Field(0, ge=0, description="seed of the weights and of the order of triples")
     ranks: int = Field(1, ge=1, description="processes that train together (DDP)")
     launcher: Literal["ray", "inline"] = Field("ray", description="ray: Ray Train; inline: this process, one rank")
+    precision: Literal["float32", "tf32", "bfloat16"] = Field(
+        "float32", description="of the wide matrix products; norms, losses and weights stay float32"
+    )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA where there is one")
     log_every: int = Field(20, ge=1, description="steps between lines of metrics.jsonl")
     evaluate_every: int = Field(500, ge=1, description="steps between PMD measurements on a fixed evaluation subset")

@@ -16,6 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from datagen.errors import DsffnetError
 from datagen.store import Dataset, open_dataset
+from training.acceleration import precision
 from training.checkpoint import CheckpointError, load_checkpoint, read_checkpoint, save_checkpoint
 from training.data import TripleOrder, VertexBank, read_batch
 from training.inference import network_from, predict
@@ -127,7 +128,8 @@ class _Trainer:
         with meter.waiting():
             batch = self.bank.batch(triples)
         self.optimiser.zero_grad(set_to_none=True)
-        prediction = self.model(source=batch.source, target=batch.target)
+        with precision(self.recipe.precision, self.device):
+            prediction = self.model(source=batch.source, target=batch.target)
         loss, terms = pose_transfer_loss(prediction, batch.truth, self.bank.edges, edge_weight=self.recipe.edge_weight)
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))

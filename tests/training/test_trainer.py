@@ -7,6 +7,7 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from filelock import FileLock
@@ -203,6 +204,21 @@ def test_two_trainings_in_one_run(dataset: str, tmp_path: Path, monkeypatch: pyt
         pytest.raises(TrainingError, match="another process is training in"),
     ):
         train(tiny_training(), data=dataset, run=tmp_path / "run")
+
+
+def test_training_in_bfloat16_reaches_the_same_loss(dataset: str, tmp_path: Path, undisturbed: Path) -> None:
+    train(tiny_training(precision="bfloat16"), data=dataset, run=tmp_path / "run")
+    rounded, exact = losses(tmp_path / "run"), losses(undisturbed)
+    assert not np.array_equal(rounded, exact) and np.allclose(rounded, exact, rtol=0.02)
+
+
+@pytest.mark.parametrize("network", [{"name": "npt", "encoder_widths": (8, 8, 13)}, {"name": "corenet3d"}])
+def test_the_baselines_learn_by_the_same_trainer(dataset: str, tmp_path: Path, network: dict) -> None:
+    if network["name"] == "corenet3d":
+        network |= {"feature_widths": (8, 8, 16), "generator_widths": (16, 16, 8)}
+    train(tiny_training(network=network, steps=30), data=dataset, run=tmp_path / "run")
+    found = losses(tmp_path / "run")
+    assert np.isfinite(found).all() and found[-5:].mean() < found[:5].mean()
 
 
 def test_ranks_that_cannot_share_the_batch() -> None:
