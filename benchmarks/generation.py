@@ -1,6 +1,6 @@
 """Making meshes: this project end to end, against the body model alone, and against the way of NPT's generator.
 
-    python benchmarks/generation.py [topology ...]
+    python -m benchmarks.generation [topology ...]
 
 For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
 skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
@@ -137,8 +137,9 @@ def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) 
 
 
 _WORKER = """
-import resource, sys, tempfile
+import sys, tempfile
 from benchmarks.generation import recipe_of
+from benchmarks.peak_memory import peak_mebibytes
 from datagen.generate import ensure_shard, prepare
 from datagen.grid import Grid
 recipe = recipe_of(sys.argv[1], identities=int(sys.argv[2]))
@@ -146,7 +147,7 @@ with tempfile.TemporaryDirectory() as folder:
     prepare(f"{folder}/x.zarr", recipe)
     for shard in Grid(recipe).shards():
         ensure_shard(f"{folder}/x.zarr", recipe, shard)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+print(peak_mebibytes())
 """
 
 
