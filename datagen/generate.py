@@ -6,6 +6,7 @@ makes and writes it; so a run after any interruption does only what is missing, 
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,24 @@ from datagen.errors import BodyError, ClusterError, DatasetError
 from datagen.grid import Grid, Shard
 from datagen.importers import require_files
 from datagen.mesh import bounds
-from datagen.places import is_local, remove, require_ours, writing_alone
+from datagen.places import remove, require_ours, writing_alone
 from datagen.poses import draw_poses, load_poses
 from datagen.recipe import DatasetRecipe, Growth
-from datagen.store.manifest import read_manifest
+from datagen.store.attributes import assets_of, check_same_assets
 from datagen.store.reader import Dataset, open_dataset
-from datagen.store.schema import ManifestRow, open_group, stored_recipe
+from datagen.store.schema import ManifestRow, open_group, shard_path, stored_recipe
 from datagen.store.verify import Fault, find_faults
-from datagen.store.writer import begin, existing_shard, finish, grow, identity_parameters, restate, write_shard
+from datagen.store.writer import (
+    begin,
+    committed_hashes,
+    existing_shard,
+    finish,
+    grow,
+    identity_parameters,
+    require_driven,
+    restate,
+    write_shard,
+)
 
 log = logging.getLogger(__name__)
 _SILENCE = 120.0  # seconds without a finished task before a person is told
@@ -55,9 +66,34 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
     return vertices
 
 
-def ensure_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow:
-    """The manifest row of a shard, which is made and written first unless it is there and sound."""
-    return existing_shard(url, recipe, shard) or write_shard(url, recipe, shard, make_shard(recipe, shard))
+def ensure_shard(url: str, recipe: DatasetRecipe, shard: Shard, committed: str | None = None) -> ManifestRow:
+    """The manifest row of a shard, which is made and written first unless it is there and sound.
+
+    ``committed`` is its sha256 where the dataset has a manifest already: other bytes are neither kept nor written.
+
+    Raises
+    ------
+    DatasetError
+        The dataset is being made by another recipe now, or from other assets than this machine has.
+    """
+    require_driven(url, recipe)
+    _require_same_assets(url, recipe.model_dump_json())
+    row = existing_shard(url, recipe, shard)
+    if row is not None and committed in (None, row.sha256):
+        return row
+    return write_shard(url, recipe, shard, make_shard(recipe, shard), committed=committed)
+
+
+@lru_cache(maxsize=64)
+def _require_same_assets(url: str, recipe: str) -> None:
+    """Once a process: this machine has the assets that the dataset was begun with."""
+    parsed = DatasetRecipe.model_validate_json(recipe)
+    if parsed.body.family not in _READS_FILES:
+        check_same_assets(url, open_group(url), assets_of(parsed, load_body(parsed.body)))
+
+
+_READS_FILES = ("imported", "mixed")
+"""Families whose assets are whole folders: they are hashed once, when a dataset is begun, and not in every worker."""
 
 
 def prepare(url: str, recipe: DatasetRecipe, growing: bool = False) -> None:
@@ -65,9 +101,7 @@ def prepare(url: str, recipe: DatasetRecipe, growing: bool = False) -> None:
     body, poses = load_body(recipe.body), load_poses(recipe.poses)
     require_joints(body, poses, family=recipe.body.family)
     require_files(recipe)
-    draw_poses(
-        recipe.poses, range(Grid(recipe).pose_count)
-    )  # a source that has too few says so before anything is written
+    draw_poses(recipe.poses, range(Grid(recipe).pose_count))  # too few poses are an error before anything is written
     if growing:
         grow(url, recipe, body)
     begin(url, recipe, body)
@@ -108,6 +142,8 @@ def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
     finally:
         for reference in running:
             ray.cancel(reference)
+        if running:  # whoever writes next must be alone
+            ray.wait(list(running), num_returns=len(running), timeout=_SILENCE)
 
 
 def generate(
@@ -140,8 +176,7 @@ def generate(
     """
     if not fresh and _complete(url, recipe):
         return open_dataset(url)
-    if is_local(url):
-        require_ours(url)
+    require_ours(url)
     with writing_alone(url):
         if fresh:
             remove(url)
@@ -156,26 +191,30 @@ def append(
     evaluation: int | None = None,
     seen: int | None = None,
     unseen: int | None = None,
+    recipe: DatasetRecipe | None = None,
     run: Runner = inline,
     progress: Progress = lambda rows, grid: rows,
 ) -> Dataset:
     """Give an existing dataset more identities or poses, up to these totals; no shard that is there is touched.
 
     The totals make it repeatable: the same call again goes on after an interruption, and does nothing when done.
-    The result is, byte for byte, what the grown recipe makes from nothing.
+    The result is, byte for byte, what the grown recipe makes from nothing. ``recipe`` is the dataset's own, with other
+    paths where asset files have moved. A store without a lock (S3) is to be appended to from one place at a time.
 
     Raises
     ------
     DatasetError
         There is no dataset, it is unfinished, or it has more than a total already.
     """
-    recipe = stored_recipe(url, open_group(url))
-    grown = _grown(url, recipe, {"training": training, "evaluation": evaluation, "seen": seen, "unseen": unseen})
-    if grown == recipe:
-        return generate(recipe, url, run=run, progress=progress)
-    open_dataset(url)  # an unfinished one must be finished first, and says how
+    totals = {"training": training, "evaluation": evaluation, "seen": seen, "unseen": unseen}
     with writing_alone(url):
-        _make_missing(grown, url, run, progress, growing=True)
+        stored = recipe or stored_recipe(url, open_group(url))
+        grown = _grown(url, stored, totals)
+        if grown != stored:
+            open_dataset(url)  # an unfinished one must be finished first, and says how
+            _make_missing(grown, url, run, progress, growing=True)
+        elif not _complete(url, stored):
+            _make_missing(stored, url, run, progress)
     return open_dataset(url)
 
 
@@ -200,16 +239,33 @@ def _grown(url: str, recipe: DatasetRecipe, totals: dict[str, int | None]) -> Da
 
 
 def _complete(url: str, recipe: DatasetRecipe) -> bool:
+    """Whether a dataset of this recipe and of the assets that it names now is there and whole."""
     try:
-        return open_dataset(url).recipe.sha256() == recipe.sha256()
+        dataset = open_dataset(url)
     except DatasetError:
         return False
+    if dataset.recipe.sha256() != recipe.sha256():
+        return False
+    try:
+        check_same_assets(url, dataset.group, assets_of(recipe, load_body(recipe.body)))
+    except BodyError as error:
+        log.warning("%s is complete; whether its assets are those of the recipe cannot be checked: %s", url, error)
+    return True
 
 
-def _make_missing(recipe: DatasetRecipe, url: str, run: Runner, progress: Progress, *, growing: bool = False) -> None:
+def _make_missing(
+    recipe: DatasetRecipe,
+    url: str,
+    run: Runner,
+    progress: Progress,
+    *,
+    growing: bool = False,
+) -> None:
     grid = Grid(recipe)
     list(run(prepare, [(url, recipe, growing)]))
-    finish(url, list(progress(run(ensure_shard, [(url, recipe, shard) for shard in grid.shards()]), grid)))
+    committed = committed_hashes(url)
+    shards = [(url, recipe, shard, committed.get(shard_path(shard))) for shard in grid.shards()]
+    finish(url, recipe, list(progress(run(ensure_shard, shards), grid)))
 
 
 def repair(
@@ -223,14 +279,6 @@ def repair(
     """Make the faulty shards and other objects again and check that the dataset is whole; the rest is not touched."""
     with writing_alone(url):
         list(run(_restate, [(url, recipe, [fault.path for fault in faults if not fault.shard])]))
-        list(run(prepare, [(url, recipe)]))
-        before = {row.path: row.sha256 for row in read_manifest(open_group(url))}
-        for row in run(_remake, [(url, recipe, fault.shard) for fault in faults if fault.shard]):
-            if before.get(row.path, row.sha256) != row.sha256:
-                raise DatasetError(
-                    f"{url}: shard {row.path} was made again, but not the same: other package versions made it "
-                    f"(dsffnet inspect {url} names them). Install those, or make the dataset anew with --fresh"
-                )
         _make_missing(recipe, url, run, progress)
     left = list(find_faults(url))
     if left:
@@ -241,7 +289,3 @@ def repair(
 def _restate(url: str, recipe: DatasetRecipe, objects: list[str]) -> None:
     if objects:
         restate(url, recipe, load_body(recipe.body), [path for path in objects if path != "zarr.json"])
-
-
-def _remake(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow:
-    return write_shard(url, recipe, shard, make_shard(recipe, shard))

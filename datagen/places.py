@@ -7,30 +7,36 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from zarr.core.sync import sync
 
 from datagen.errors import DatasetError
-from datagen.store.schema import NoDataset, check_ours, open_group
+from datagen.store.schema import NoDataset, check_ours, delete_object, list_objects, open_group, plain
+
+_MEMBERS = ("topology", "identity", "pose", "evaluation", "manifest")
 
 
 def is_local(url: str) -> bool:
     """Whether a store URL is a folder of a file system."""
-    return "://" not in url
+    return "://" not in plain(url)
 
 
 def remove(url: str) -> None:
-    """Remove a dataset; nothing happens where there is none.
+    """Remove a dataset; nothing happens where there is none. Its root goes last, so that a rest is still known as ours.
 
     Raises
     ------
     DatasetError
         The place holds something that is not a dataset.
     """
+    require_ours(url)
     if not is_local(url):
         _remove_remote(url)
         return
-    require_ours(url)
-    shutil.rmtree(url, ignore_errors=not Path(url).exists())
+    folder = Path(plain(url))
+    for member in _MEMBERS:
+        shutil.rmtree(folder / member, ignore_errors=not (folder / member).exists())
+    (folder / "zarr.json").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # something of the person's is in it
+        folder.rmdir()
 
 
 def _remove_remote(url: str) -> None:
@@ -38,29 +44,38 @@ def _remove_remote(url: str) -> None:
         group = open_group(url, mode="r+")
     except NoDataset:
         return
-    check_ours(url, group)
-    sync(group.store.delete_dir(group.path))
+    for path in sorted(list_objects(group), key=lambda path: path == "zarr.json"):
+        delete_object(group, path)
 
 
 def require_ours(url: str) -> None:
-    """Refuse a local place that holds anything but a dataset of ours.
+    """Refuse a place that holds anything but a dataset of ours.
 
     Raises
     ------
     DatasetError
-        It is a file, or a folder with other things in it.
+        It is a file, somebody else's Zarr group, or a folder with other things in it.
     """
-    path = Path(url)
-    if path.is_file():
+    if not is_local(url):
+        with contextlib.suppress(NoDataset):
+            check_ours(url, open_group(url))
+        return
+    path = Path(plain(url))
+    if path.exists() and not path.is_dir():
         raise DatasetError(f"{url} is a file, not a dataset. Choose another --out")
-    strangers = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")} if path.exists() else set()
-    if strangers - _MEMBERS:
-        raise DatasetError(
-            f"{url} holds what is not a dataset ({sorted(strangers - _MEMBERS)[0]}). Choose another --out"
-        )
+    there = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
+    if there and not _has_our_root(path):
+        raise DatasetError(f"{url} holds what is not a dataset ({there[0]}). Choose another --out")
+    strangers = [name for name in there if not name.startswith(".") and name not in (*_MEMBERS, "zarr.json")]
+    if strangers:
+        raise DatasetError(f"{url} holds what is not a dataset ({strangers[0]}). Choose another --out")
 
 
-_MEMBERS = {"zarr.json", "topology", "identity", "pose", "evaluation", "manifest"}
+def _has_our_root(path: Path) -> bool:
+    """Whether the folder's zarr.json is one that we wrote, be it damaged since."""
+    root = path / "zarr.json"
+    content = root.read_bytes() if root.is_file() else b""
+    return b'"format_version"' in content or b'"recipe_sha256"' in content
 
 
 @contextlib.contextmanager
@@ -69,7 +84,7 @@ def writing_alone(url: str) -> Iterator[None]:
     if not is_local(url):
         yield
         return
-    lock = FileLock(f"{os.path.abspath(url)}.lock")
+    lock = FileLock(f"{os.path.realpath(plain(url))}.lock")
     try:
         Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
         with lock.acquire(timeout=0):

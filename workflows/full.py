@@ -21,8 +21,8 @@ from contextlib import ExitStack
 from functools import partial
 
 from datagen.store import open_dataset
+from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
-from datagen.store.writer import check_same_recipe
 from training.record import read_record, update_record
 from training.tracking import Mirror
 from workflows.cluster import ray_cluster, require_reachable

@@ -1,6 +1,7 @@
 """Reading a dataset: only a complete and sound one; anything else is an error that names the mending command."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -72,8 +73,12 @@ class Dataset:
 
     def faces(self, identity: int) -> NDArray[np.int32]:
         """Triangles [face, 3] of an identity."""
-        topology = self.group[f"identity/{identity_name(identity)}"].attrs["topology"]
-        return self._small(f"topology/{topology}/faces")
+        return self._faces_of(str(self._attribute(f"identity/{identity_name(identity)}", "topology")))
+
+    def _faces_of(self, topology: str) -> NDArray[np.int32]:
+        if topology not in self._topologies:
+            self._topologies[topology] = self._small(f"topology/{topology}/faces")
+        return self._topologies[topology]
 
     def parameters(self, identity: int) -> NDArray[np.float64]:
         """Body-model parameters [parameter] of an identity."""
@@ -86,7 +91,18 @@ class Dataset:
 
     def vertex_count(self, identity: int) -> int:
         """Vertices of an identity's meshes."""
-        return int(array_at(self.group, vertices_path(identity)).shape[1])
+        if identity not in self._counts:
+            with self._metadata_of(vertices_path(identity)):
+                self._counts[identity] = int(array_at(self.group, vertices_path(identity)).shape[1])
+        return self._counts[identity]
+
+    @cached_property
+    def _counts(self) -> dict[int, int]:
+        return {}
+
+    @cached_property
+    def _topologies(self) -> dict[str, NDArray[np.int32]]:
+        return {}
 
     def vertices(self, identity: int, poses: int | Sequence[int] | NDArray[np.integer] | None = None) -> Meshes:
         """Vertices [pose, vertex, 3] float32 in metres of an identity in some poses; [vertex, 3] for one number.
@@ -137,9 +153,18 @@ class Dataset:
         return found
 
     def _small(self, path: str) -> NDArray[Any]:
-        try:
+        with self._metadata_of(path):
             return np.asarray(array_at(self.group, path)[...])
-        except (KeyError, RuntimeError, ValueError, OSError) as error:
+
+    def _attribute(self, path: str, name: str) -> Any:
+        with self._metadata_of(path):
+            return self.group[path].attrs[name]
+
+    @contextmanager
+    def _metadata_of(self, path: str) -> Iterator[None]:
+        try:
+            yield
+        except (KeyError, RuntimeError, ValueError, TypeError, OSError) as error:
             raise DatasetError(f"{self.url}: {path} is missing or damaged ({error}). {self._mend}") from error
 
     def evaluation_triples(self, pose_type: PoseType) -> NDArray[np.int32]:
@@ -163,7 +188,7 @@ def open_dataset(url: str) -> Dataset:
     """
     group = open_group(url)
     check_version(url, group)
-    status = attributes_of(group)["status"]
+    status = attributes_of(group).get("status")
     if status != "complete":
         raise DatasetError(
             f"{url} is incomplete (status {status!r}). Finish it: run the command that made it again, "

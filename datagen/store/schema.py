@@ -11,6 +11,9 @@ NAME.zarr                     status building|complete, recipe, splits, provenan
 """
 
 import asyncio
+import contextlib
+import os
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -21,8 +24,9 @@ from zarr.abc.store import ByteRequest
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
+from zarr.errors import ContainsGroupError
 
-from datagen.errors import DatasetError
+from datagen.errors import DatasetError, StorageError
 from datagen.grid import Grid, Shard, Split
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardCodec
@@ -102,6 +106,14 @@ def array_at(group: zarr.Group, path: str) -> zarr.Array[Any]:
     return found
 
 
+def stored_vertex_count(group: zarr.Group, identity: int) -> int | None:
+    """Vertices of an identity's meshes; None where its array has no metadata that can be read."""
+    try:
+        return int(array_at(group, vertices_path(identity)).shape[1])
+    except (KeyError, RuntimeError, ValueError, TypeError, OSError):
+        return None
+
+
 def attributes_of(group: zarr.Group) -> dict[str, Any]:
     """Attributes of a group as a plain dictionary."""
     return dict(group.attrs.asdict())
@@ -172,23 +184,81 @@ def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
     return dict(found for found in sync(sizes()) if found is not None)
 
 
+def plain(url: str) -> str:
+    """A store URL without ``file://``: such a dataset is a folder like any other."""
+    return url.removeprefix("file://")
+
+
 def open_group(url: str, *, mode: str = "r") -> zarr.Group:
     """The root group of a dataset.
 
     Raises
     ------
+    NoDataset
+        There is nothing at ``url``.
     DatasetError
-        There is no dataset at ``url``, or its metadata cannot be read.
+        What is there cannot be read as a dataset.
+    StorageError
+        The store cannot be reached.
     """
     try:
-        return zarr.open_group(url, mode=mode, zarr_format=3)  # type: ignore[arg-type]
+        with storage_errors(url):
+            return zarr.open_group(plain(url), mode=mode, zarr_format=3)  # type: ignore[arg-type]
     except FileNotFoundError as error:
         raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError) as error:
         raise DatasetError(
-            f"{url} is not a readable dataset ({error}). Name a folder that dsffnet generate made"
+            f"{url} is not a readable dataset: its zarr.json cannot be read ({error}). If it was one, make it again: "
+            f"dsffnet generate --recipe RECIPE --out {url} --fresh"
+        ) from error
+
+
+def create_group(url: str, attributes: dict[str, Any]) -> zarr.Group:
+    """The root group of a new dataset, with its attributes in one write.
+
+    Raises
+    ------
+    DatasetError
+        There is something else at ``url``.
+    """
+    strangers = [name for name in _names_at(url) if not name.startswith(".")]
+    if strangers and "zarr.json" not in strangers:
+        raise DatasetError(f"{url} holds what is not a dataset ({strangers[0]}). Choose another --out")
+    try:
+        with storage_errors(url):
+            return zarr.create_group(plain(url), attributes=attributes, zarr_format=3)
+    except ContainsGroupError:  # on a store without a lock, somebody else was first
+        return open_group(url, mode="r+")
+
+
+def _names_at(url: str) -> list[str]:
+    """Names of what lies directly at a place."""
+    if "://" not in plain(url):
+        return sorted(os.listdir(plain(url))) if os.path.isdir(plain(url)) else []
+    from fsspec.core import url_to_fs
+
+    with storage_errors(url):
+        system, path = url_to_fs(url)
+        system.invalidate_cache()
+        try:
+            return sorted(str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in system.ls(path, detail=False))
+        except FileNotFoundError:
+            return []
+
+
+@contextlib.contextmanager
+def storage_errors(url: str) -> Iterator[None]:
+    """Turn what cloud clients raise (no credentials, no such address) into one error a person can act on."""
+    try:
+        yield
+    except Exception as error:
+        if type(error).__module__.split(".")[0] not in ("botocore", "aiobotocore", "gcsfs", "google", "azure"):
+            raise
+        raise StorageError(
+            f"{url} cannot be reached ({error}). Check its address and your credentials; for S3: AWS_ACCESS_KEY_ID, "
+            "AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL"
         ) from error
 
 

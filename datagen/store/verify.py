@@ -21,6 +21,7 @@ from datagen.store.schema import (
     shard_path,
     stored_recipe,
     stored_sizes,
+    stored_vertex_count,
     vertices_path,
 )
 from datagen.store.writer import existing_shard
@@ -50,7 +51,7 @@ def find_faults(url: str, *, progress: Progress = iter) -> Iterator[Fault]:
         if reason:
             yield Fault(shard_path(shard), reason, shard)
     yield from (Fault(path, reason) for path, reason in changed_objects(group))
-    if attributes_of(group)["status"] == "complete":
+    if attributes_of(group).get("status") == "complete":
         yield from _root_faults(group)
 
 
@@ -69,7 +70,10 @@ def _fault(url: str, recipe: DatasetRecipe, shard: Shard, row: ManifestRow | Non
         return "missing"
     if len(content) != row.bytes:
         return f"{len(content)} bytes instead of {row.bytes}"
-    return None if hashlib.sha256(content).hexdigest() == row.sha256 else "its sha256 is not the manifest's"
+    if hashlib.sha256(content).hexdigest() != row.sha256:
+        return "its sha256 is not the manifest's"
+    metadata_is_lost = stored_vertex_count(open_group(url), shard.identity) is None  # a fault of its own
+    return None if metadata_is_lost or existing_shard(url, recipe, shard) else "cannot be decoded"
 
 
 def describe(url: str) -> dict[str, Any]:
@@ -83,8 +87,8 @@ def describe(url: str) -> dict[str, Any]:
     sizes = stored_sizes(group, [shard_path(shard) for shard in shards])
     facts = {
         "dataset": url,
-        "status": attributes["status"],
-        "uuid": attributes["uuid"],
+        "status": attributes.get("status", "unknown"),
+        "uuid": attributes.get("uuid", "unknown"),
         "body": f"{recipe.body.family} {_kind(recipe)}".strip(),
         "identities": ", ".join(f"{_count(grid.identities(split))} {split}" for split in SPLITS),
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "

@@ -6,11 +6,7 @@ missing, a shard is written once and whole by one task, and ``status: complete``
 
 import contextlib
 import hashlib
-import importlib.metadata
-import subprocess
-import uuid
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,21 +17,22 @@ from zarr.errors import ContainsArrayError
 
 from datagen.bodies import BodyModel
 from datagen.errors import DatasetError, StorageError
-from datagen.grid import POSE_TYPES, Grid, Shard
+from datagen.grid import Grid, Shard
 from datagen.importers import evaluation_lists
 from datagen.mesh import bounds
-from datagen.poses import draw_poses, load_poses
+from datagen.poses import draw_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
+from datagen.store.attributes import assets_of, check_same_assets, check_same_recipe, provenance, stated
 from datagen.store.codec import ShardDamage
-from datagen.store.manifest import commit
+from datagen.store.manifest import commit, read_manifest
 from datagen.store.schema import (
-    FORMAT_VERSION,
     ManifestRow,
+    NoDataset,
     array_at,
     attributes_of,
-    check_version,
     codec_of,
+    create_group,
     create_vertices_array,
     delete_object,
     identity_name,
@@ -43,14 +40,14 @@ from datagen.store.schema import (
     open_group,
     read_bytes,
     shard_path,
-    stored_recipe,
+    storage_errors,
     stored_sizes,
+    stored_vertex_count,
     vertices_path,
     write_bytes,
 )
 
-_NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
-_PACKAGES = ("anny", "smplx", "numpy", "scipy", "zarr", "numcodecs")
+_GROUPS = ("topology", "identity", "pose", "evaluation", "manifest")
 
 
 def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
@@ -64,45 +61,104 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
     Raises
     ------
     DatasetError
-        A dataset of another recipe, other assets or another version is there already.
+        A dataset of another recipe, other assets or another version is there already, or something else is.
     """
     with _writing(url):
-        group = open_group(url, mode="a")
-        if "format_version" in group.attrs:
-            check_same_recipe(url, group, recipe)
-            _check_same_assets(url, group, _assets(recipe, body))
-        else:
-            group.update_attributes(_attributes(recipe, body))
+        wanted = stated(recipe, body)
+        try:
+            group = open_group(url, mode="r+")
+        except NoDataset:
+            group = create_group(url, {**wanted, "status": "building", "provenance": provenance(None)})
+        check_same_recipe(url, group, recipe)
+        check_same_assets(url, group, assets_of(recipe, body))
+        _restate(group, wanted)
         _create_arrays(group, recipe, body)
 
 
 def grow(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
-    """Give a complete dataset a recipe that has grown: from here on it is a dataset in the making."""
+    """Give a complete dataset a recipe that has grown by one step: from here on it is a dataset in the making.
+
+    Raises
+    ------
+    DatasetError
+        The dataset is not the one that the recipe grew from.
+    """
     with _writing(url):
         group = open_group(url, mode="r+")
-        _check_same_assets(url, group, _assets(recipe, body))
-        group.update_attributes(_attributes(recipe, body, attributes_of(group)["provenance"]))
+        check_same_recipe(url, group, recipe.model_copy(update={"growth": recipe.growth[:-1]}))
+        check_same_assets(url, group, assets_of(recipe, body))
+        made_by = provenance(attributes_of(group).get("provenance"))
+        group.update_attributes({**stated(recipe, body), "status": "building", "provenance": made_by})
 
 
-def write_shard(url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32]) -> ManifestRow:
-    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row."""
+def restate(url: str, recipe: DatasetRecipe, body: BodyModel, objects: Sequence[str]) -> None:
+    """Write the root's attributes anew and remove other objects that were lost or changed: ``begin`` makes them."""
+    with _writing(url):
+        group = open_group(url, mode="r+")
+        check_same_recipe(url, group, recipe)
+        made_by = provenance(attributes_of(group).get("provenance"))
+        group.update_attributes({**stated(recipe, body), "status": "building", "provenance": made_by})
+        for path in objects:
+            delete_object(group, path)
+
+
+def _restate(group: zarr.Group, wanted: dict[str, Any]) -> None:
+    present = attributes_of(group)
+    if {key: present.get(key) for key in wanted} != wanted:
+        group.update_attributes(wanted)
+
+
+def require_driven(url: str, recipe: DatasetRecipe) -> zarr.Group:
+    """The dataset's group, if it is still the one that a task was sent to make.
+
+    Raises
+    ------
+    DatasetError
+        It has been removed, or begun anew by another recipe.
+    """
+    group = open_group(url, mode="r+")
+    if attributes_of(group).get("recipe_sha256") != recipe.sha256():
+        raise DatasetError(f"{url} is being made by another recipe now; this task leaves it alone. Run one at a time")
+    return group
+
+
+def write_shard(
+    url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32], *, committed: str | None = None
+) -> ManifestRow:
+    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row.
+
+    Raises
+    ------
+    DatasetError
+        The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its array's
+        shape; nothing is written then.
+    """
+    path, group = shard_path(shard), require_driven(url, recipe)
+    expected = (shard.rows, array_at(group, vertices_path(shard.identity)).shape[1], 3)
+    if vertices.shape != expected:
+        raise DatasetError(f"{url}: shard {path} came out of shape {list(vertices.shape)} instead of {list(expected)}")
     codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=vertices.shape[1])
-    content, path = codec.encode(vertices), shard_path(shard)
+    content = codec.encode(vertices)
+    row = _row(shard, content, vertices)
+    if committed not in (None, row.sha256):
+        raise DatasetError(
+            f"{url}: shard {path} was made again, but not the same: other package versions made it "
+            f"(dsffnet inspect {url} names them). Install those, or make the dataset anew with --fresh"
+        )
     with _writing(url):
-        group = open_group(url, mode="r+")
         write_bytes(group, path, content)
         if stored_sizes(group, [path]) != {path: len(content)}:
             raise DatasetError(f"{url}: shard {path} is not there as it was written; is the storage sound?")
-    return _row(shard, content, vertices)
+    return row
 
 
 def existing_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:
     """The manifest row of a shard that is there, whole and sound; None where it is missing or damaged."""
     group = open_group(url)
     content = read_bytes(group, shard_path(shard))
-    if content is None:
+    count = stored_vertex_count(group, shard.identity)
+    if content is None or count is None:
         return None
-    count = array_at(group, vertices_path(shard.identity)).shape[1]
     try:
         codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=count)
         return _row(shard, content, codec.decode(content, shard.rows))
@@ -127,8 +183,14 @@ def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def finish(url: str, rows: Sequence[ManifestRow]) -> None:
-    """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files."""
+def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
+    """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
+
+    Raises
+    ------
+    DatasetError
+        Meanwhile the dataset was begun anew by another recipe, or a shard is not what its task wrote.
+    """
     statistics = {
         "meshes": sum(row.rows for row in rows),
         "bytes": sum(row.bytes for row in rows),
@@ -136,59 +198,28 @@ def finish(url: str, rows: Sequence[ManifestRow]) -> None:
         "maximum": np.max([row.maximum for row in rows], axis=0).tolist(),
     }
     with _writing(url):
-        group = open_group(url, mode="r+")
+        group = require_driven(url, recipe)
+        sizes = stored_sizes(group, [row.path for row in rows])
+        for row in rows:
+            if sizes.get(row.path) != row.bytes:
+                raise DatasetError(f"{url}: shard {row.path} was changed by somebody else. Run the same command again")
         for path in list_objects(group):
             if path.endswith(".partial"):
                 delete_object(group, path)
         commit(group, rows, {"statistics": statistics, "status": "complete"})
 
 
-def restate(url: str, recipe: DatasetRecipe, body: BodyModel, objects: Sequence[str]) -> None:
-    """Write the root's attributes and these other objects anew: they were lost or changed."""
-    with _writing(url):
-        group = open_group(url, mode="r+")
-        check_same_recipe(url, group, recipe)
-        group.update_attributes(_attributes(recipe, body, attributes_of(group).get("provenance")))
-        for path in objects:
-            delete_object(group, path)
-
-
-def _attributes(recipe: DatasetRecipe, body: BodyModel, provenance: Any = None) -> dict[str, Any]:
-    grid, digest = Grid(recipe), recipe.sha256()
-    assets, poses = _assets(recipe, body), load_poses(recipe.poses)
-    return {
-        "format_version": FORMAT_VERSION,
-        "uuid": str(uuid.uuid5(_NAMESPACE, f"{FORMAT_VERSION} {digest} {assets}")),
-        "status": "building",
-        "recipe": recipe.model_dump(mode="json"),
-        "recipe_sha256": digest,
-        "body": {"family": recipe.body.family, "assets": assets, "parameters": list(body.parameter_names)},
-        "provenance": _provenance(provenance),
-        "units": "metres",
-        "frame": "Y up, facing +Z, +X to the body's left",
-        "joints": list(poses.joints),
-        "joint_parents": list(poses.parents),
-        "splits": {
-            "identities": {identity_name(i): grid.split(i) for i in range(grid.identity_count)},
-            "poses": {kind: _spans(grid.poses(kind)) for kind in POSE_TYPES},
-        },
-    }
-
-
-def _assets(recipe: DatasetRecipe, body: BodyModel) -> list[dict[str, str]]:
-    """What the bytes depend on beside the recipe: the body's files and packages, and the poses'."""
-    return [vars(asset) for asset in dict.fromkeys([*body.assets, *load_poses(recipe.poses).assets])]
-
-
-def _spans(numbers: NDArray[np.int64]) -> list[list[int]]:
-    """Numbers as a few ranges [first, end)."""
-    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
-    return [[int(run[0]), int(run[-1]) + 1] for run in np.split(numbers, breaks) if len(run)]
+def committed_hashes(url: str) -> dict[str, str]:
+    """The sha256 of each shard that a dataset's manifest has, by path; empty where there is none."""
+    try:
+        return {row.path: row.sha256 for row in read_manifest(open_group(url))}
+    except NoDataset:
+        return {}
 
 
 def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
     grid = Grid(recipe)
-    for name in ("topology", "identity", "pose", "evaluation", "manifest"):
+    for name in _GROUPS:
         group.require_group(name)
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
@@ -201,7 +232,9 @@ def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) ->
         topology = topologies.setdefault(faces.tobytes(), str(len(topologies)))
         group.require_group(f"topology/{topology}")
         _put(group, f"topology/{topology}/faces", faces, ("face", "corner"))
-        _create_identity(group, grid, identity, parameters, int(faces.max()) + 1, topology)
+        one_pose = draw_poses(recipe.poses, grid.poses_of(identity)[:1])
+        vertices = body.vertices(parameters, one_pose).shape[1]  # not faces.max() + 1: some vertices may be in no face
+        _create_identity(group, grid, identity, parameters, vertices, topology)
 
 
 def _create_identity(
@@ -242,72 +275,13 @@ def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
         return False
 
 
-def _check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:
-    stored = attributes_of(group)["body"]["assets"]
-    if stored == present:
-        return
-    changed = [asset for asset in stored if asset not in present] or stored
-    raise DatasetError(
-        f"{url} was made from {_named(changed)}, but here is {_named([a for a in present if a not in stored])}. "
-        "Use what it was made from, or write to another place, or add --fresh to make it anew"
-    )
-
-
-def _named(assets: Sequence[dict[str, Any]]) -> str:
-    return ", ".join(f"{asset['name']} {asset['version']}" for asset in assets) or "nothing of the kind"
-
-
-def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
-    """Refuse to go on with a dataset that another recipe (or version) began; the message names what differs."""
-    check_version(url, group)
-    attributes = attributes_of(group)
-    if attributes["recipe_sha256"] == recipe.sha256():
-        return
-    stored = stored_recipe(url, group)
-    changed = ", ".join(_differences(stored.identifying(), recipe.identifying()))
-    raise DatasetError(
-        f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"
-    )
-
-
-def _differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "data") -> Iterator[str]:
-    for key in sorted(old.keys() | new.keys()):
-        before, after = old.get(key), new.get(key)
-        if isinstance(before, dict) and isinstance(after, dict):
-            yield from _differences(before, after, f"{prefix}.{key}")
-        elif before != after:
-            yield f"{prefix}.{key}: {before} there, {after} here"
-
-
 @contextlib.contextmanager
 def _writing(url: str) -> Iterator[None]:
     try:
-        yield
+        with storage_errors(url):
+            yield
     except OSError as error:
         raise StorageError(
             f"could not write to {url}: {error.strerror or error}. What was complete is untouched; "
             "make room or choose another --out, then run the same command again"
         ) from error
-
-
-def _provenance(earlier: Any) -> dict[str, Any]:
-    """What makes the data here and now, and what made the part that is there already, if that was something else."""
-    now = {"packages": _versions(), "git_commit": _git_commit()}
-    before = dict(earlier) if isinstance(earlier, dict) else {}
-    history = before.pop("earlier", [])
-    if before and before != now:
-        history = [*history, before]
-    return {**now, "earlier": history} if history else now
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
-
-
-def _git_commit() -> str:
-    """Commit of the working tree this code runs from, or 'unknown' (an installed copy, a submitted job)."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"

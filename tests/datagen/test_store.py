@@ -145,10 +145,10 @@ def test_what_a_killed_writer_left_of_a_file_is_removed(dataset: str, spoilable:
 
 def test_provenance_names_what_made_the_part_that_was_there(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from datagen.generate import append
-    from datagen.store import writer
+    from datagen.store import attributes
 
     before = open_dataset(str(spoilable)).attributes["provenance"]
-    monkeypatch.setattr(writer, "_git_commit", lambda: "another")
+    monkeypatch.setattr(attributes, "_git_commit", lambda: "another")
     after = append(str(spoilable), training=4).attributes["provenance"]
     assert after["git_commit"] == "another" and after["earlier"] == [before]
 
