@@ -307,6 +307,12 @@ class DatasetRecipe(Frozen):
     store: StoreRecipe = Field(default_factory=StoreRecipe)
     growth: tuple[Growth, ...] = Field((), description="what `dsffnet append` added, step by step")
 
+    @model_validator(mode="after")
+    def _holds_something(self) -> "DatasetRecipe":
+        if not self.identities.training + self.identities.evaluation:
+            raise ValueError("identities: training and evaluation are both 0, so there would be no meshes")
+        return self
+
     def identifying(self) -> dict[str, Any]:
         """The recipe as plain data, without the paths of asset files: where a file lies does not change its bytes.
 
@@ -320,10 +326,14 @@ class DatasetRecipe(Frozen):
         return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-_PATHS = {"path", "families", "test_list"}
+PATH_KEYS = frozenset({"path", "families", "test_list"})
+"""Keys of a recipe that name files; where these lie is not part of a dataset\'s identity."""
+
+ANIMALS = "animals"
+"""In the place of a path: the twelve CC0 animals."""
 
 
 def _without_paths(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_paths(inner) for key, inner in value.items() if key not in _PATHS}
+        return {key: _without_paths(inner) for key, inner in value.items() if key not in PATH_KEYS}
     return [_without_paths(inner) for inner in value] if isinstance(value, list) else value

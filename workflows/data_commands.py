@@ -1,7 +1,7 @@
 """The subcommands of ``dsffnet`` that make, show, check, take in and give out data."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args
@@ -9,11 +9,11 @@ from typing import Any, get_args
 from datagen.errors import DatasetError, RecipeError
 from datagen.exporters import ExportLayout
 from datagen.layouts import Layout
-from datagen.recipe import AnnyTopology
+from datagen.recipe import PATH_KEYS, AnnyTopology, DatasetRecipe
 from datagen.standins import Kind
 from workflows.commands import add_command, print_facts
 from workflows.console import add_recipe_options, add_set_option
-from workflows.recipe import change_recipe, load_recipe, override_values, recipe_faults
+from workflows.recipe import change_recipe, load_recipe, override_values, recipe_faults, with_absolute_paths
 
 
 def generate_command(options: argparse.Namespace) -> None:
@@ -33,8 +33,9 @@ def append_command(options: argparse.Namespace) -> None:
     totals = {name: getattr(options, name) for name in ("training", "evaluation", "seen", "unseen")}
     if not any(total is not None for total in totals.values()):
         raise RecipeError("nothing to append: name at least one of --training, --evaluation, --seen, --unseen")
+    recipe = _own_recipe(options.out, options.set)
     with _runner(options) as how:
-        append(options.out, **totals, **how)
+        append(options.out, **totals, recipe=recipe, **how)
     _show(options.out)
 
 
@@ -55,11 +56,11 @@ def verify_command(options: argparse.Namespace) -> None:
     """Check every shard; with --repair, make the faulty ones again."""
     from datagen.generate import inline, repair
     from datagen.grid import Grid
-    from datagen.store.verify import find_faults, require_recipe
+    from datagen.store.verify import find_faults
     from workflows.pipeline import generation_bar, is_complete
     from workflows.progress import bar
 
-    recipe = require_recipe(options.dataset)
+    recipe = _own_recipe(options.dataset, options.set)
     count = len(Grid(recipe).shards())
     faults = list(
         find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
@@ -77,12 +78,29 @@ def verify_command(options: argparse.Namespace) -> None:
     print(f"{options.dataset} is whole again")
 
 
+def _own_recipe(url: str, overrides: Sequence[str]) -> DatasetRecipe:
+    """The recipe stored with a dataset, with other paths of asset files.
+
+    Raises
+    ------
+    RecipeError
+        Something else than a path is changed.
+    """
+    from datagen.store.verify import require_recipe
+
+    stored = require_recipe(url)
+    recipe = change_recipe({"data": stored.model_dump(mode="json")}, overrides, where=url).data
+    if recipe.sha256() != stored.sha256():
+        raise RecipeError(f"--set can only change where the asset files of {url} lie: {', '.join(sorted(PATH_KEYS))}")
+    return recipe
+
+
 def import_command(options: argparse.Namespace) -> None:
     """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset."""
     from datagen.generate import generate
     from datagen.importers import found_recipe
 
-    of_body = override_values(options.set).get("data", {}).get("body", {})
+    of_body = _body_options(options.set)
     with recipe_faults(f"import {options.layout}"):
         found = found_recipe(options.layout, options.folder, **of_body)
     base = {"data": found.model_dump(mode="json")}
@@ -90,6 +108,18 @@ def import_command(options: argparse.Namespace) -> None:
     with _runner(options) as how:
         generate(recipe, options.out, fresh=options.fresh, **how)
     _show(options.out)
+
+
+def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
+    """What ``--set data.body.*`` says: it decides which files are found."""
+    section: Any = override_values(overrides)
+    for name in ("data", "body"):
+        section = section.get(name, {})
+        if not isinstance(section, dict):
+            raise RecipeError(f"--set {name}={section} is a whole section; set its keys, e.g. --set data.body.up=z")
+    for fixed in section.keys() & {"family", "layout", "path"}:
+        raise RecipeError(f"--set data.body.{fixed} is said by the command itself: dsffnet import LAYOUT FOLDER")
+    return dict(with_absolute_paths(section, Path.cwd()))
 
 
 def export_command(options: argparse.Namespace) -> None:
@@ -195,6 +225,7 @@ def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentPar
     ):
         append.add_argument(f"--{name}", type=int, metavar="TOTAL", help=f"{what}, with those that are there")
     append.add_argument("--local", action="store_true", help="in this process, without Ray")
+    add_set_option(append)
 
     inspect = add_command(commands, inspect_command, _EXAMPLES[inspect_command])
     inspect.add_argument("dataset", metavar="X.zarr")
@@ -203,6 +234,7 @@ def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentPar
     verify = add_command(commands, verify_command, _EXAMPLES[verify_command])
     verify.add_argument("dataset", metavar="X.zarr")
     verify.add_argument("--repair", action="store_true", help="make faulty or missing shards again")
+    add_set_option(verify)
 
     take = add_command(commands, import_command, _EXAMPLES[import_command])
     take.add_argument("layout", choices=get_args(Layout), help="how the files lie (docs/importing.md)")

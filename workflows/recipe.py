@@ -1,6 +1,7 @@
 """The recipe of a whole workflow: its sections, reading it from YAML, overrides, and errors a person can act on."""
 
 import difflib
+import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pydantic import BaseModel, Field, ValidationError
 from datagen.bodies import FAMILIES
 from datagen.errors import RecipeError
 from datagen.poses import SOURCES
-from datagen.recipe import DatasetRecipe, Frozen
+from datagen.recipe import ANIMALS, PATH_KEYS, DatasetRecipe, Frozen
 from training.recipe import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
 
 _FOLDER = Path(__file__).parent / "recipes"
@@ -49,17 +50,24 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
+    folder = base.resolve().parent if isinstance(base, Path) else Path.cwd()
     try:
-        config = OmegaConf.load(base) if isinstance(base, Path) else OmegaConf.create(base)
+        read = OmegaConf.to_container(OmegaConf.load(base)) if isinstance(base, Path) else base
+        config = OmegaConf.create(with_absolute_paths(read, folder))
         changes = OmegaConf.create(override_values(overrides))
         for section, kind, default in _KINDS:
             chosen = OmegaConf.select(changes, f"{section}.{kind}")
             if chosen is not None and chosen != OmegaConf.select(config, f"{section}.{kind}", default=default):
                 OmegaConf.update(config, section, {}, merge=False)  # the keys of another kind would not fit it
-        values = OmegaConf.to_container(OmegaConf.merge(config, changes), resolve=True)
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
+        for override in overrides:  # one by one, as a key may count the entries of a list
+            key = override.split("=", 1)[0]
+            value = OmegaConf.select(OmegaConf.from_dotlist([override]), key)
+            last = key.rsplit(".", 1)[-1]
+            OmegaConf.update(config, key, with_absolute_paths({last: value}, Path.cwd())[last], merge=True)
+        values = OmegaConf.to_container(config, resolve=True)
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AttributeError, IndexError) as error:
         raise RecipeError(f"recipe {where} cannot be read: {_first_line(error)}") from error
-    return check_recipe(_with_absolute_paths(values), where=where)
+    return check_recipe(values, where=where)
 
 
 def override_values(overrides: Sequence[str]) -> dict[str, Any]:
@@ -83,20 +91,30 @@ def override_values(overrides: Sequence[str]) -> dict[str, Any]:
         raise RecipeError(f"--set {' '.join(overrides)} cannot be read: {_first_line(error)}") from error
 
 
-_PATHS = {"path", "families", "test_list"}
+def with_absolute_paths(values: Any, folder: Path) -> Any:
+    """The same with absolute paths of files that lie in ``folder``: tasks run in other folders.
 
-
-def _with_absolute_paths(values: Any) -> Any:
-    """The same with absolute paths of files that are there: tasks on a cluster run in other folders."""
+    Raises
+    ------
+    RecipeError
+        On a cluster, where this folder is a copy that is thrown away, a path is relative.
+    """
     if isinstance(values, dict):
         return {
-            key: _absolute(value) if key in _PATHS else _with_absolute_paths(value) for key, value in values.items()
+            key: _absolute(value, folder) if key in PATH_KEYS else with_absolute_paths(value, folder)
+            for key, value in values.items()
         }
-    return [_with_absolute_paths(value) for value in values] if isinstance(values, list) else values
+    return [with_absolute_paths(value, folder) for value in values] if isinstance(values, list) else values
 
 
-def _absolute(value: Any) -> Any:
-    return str(Path(value).resolve()) if isinstance(value, str) and value and Path(value).exists() else value
+def _absolute(value: Any, folder: Path) -> Any:
+    if not isinstance(value, str) or value in ("", ANIMALS) or not (folder / value).exists():
+        return value
+    if "RAY_ADDRESS" in os.environ and not Path(value).is_absolute():
+        raise RecipeError(
+            f"{value!r} is a relative path, which other machines do not have. On a cluster name a full one"
+        )
+    return str((folder / value).resolve())
 
 
 def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:

@@ -103,3 +103,38 @@ def test_a_hostile_pickle_is_refused_by_name(tmp_path: Path) -> None:
     refused = command("convert-body", tmp_path / "model.pkl", "--out", tmp_path / "model.npz")
     fails(refused, 1, "system", "model.pkl")
     assert not trace.exists() and not (tmp_path / "model.npz").exists()
+
+
+def test_a_moved_model_file_is_named_when_going_on(tmp_path: Path) -> None:
+    command("stand-in", "smpl", "--out", tmp_path / "a.npz", "--topology", "notoes_collapse3pc")
+    small = ["data.identities.training=2", "data.identities.evaluation=2", "data.poses.seen=4", "data.poses.unseen=2"]
+    data = tmp_path / "x.zarr"
+    path = f"data.body.path={tmp_path}"
+    made = command("generate", "--recipe", "smpl-paper", "--set", f"{path}/a.npz", *small, "--out", data, "--local")
+    assert made.returncode == 0, made.stderr
+    (tmp_path / "a.npz").rename(tmp_path / "b.npz")
+    fails(command("append", data, "--unseen", "3", "--local"), 1, "a.npz")
+    (data / "identity/0001/vertices/c/0/0/0").unlink()
+    assert command("verify", data, "--repair", "--set", f"{path}/b.npz").returncode == 0
+    assert command("append", data, "--unseen", "3", "--local").returncode == 0, "the new path was kept"
+    fails(command("append", data, "--unseen", "4", "--set", "data.poses.seed=4"), 2, "can only change where")
+
+
+def test_import_refuses_what_the_command_says_itself(tmp_path: Path) -> None:
+    for given, says in (
+        ("data=5", "a whole section"),
+        ("data.body=5", "a whole section"),
+        ("data.body.path=x", "is said by the command itself"),
+        ("data.body.layout=faust", "is said by the command itself"),
+    ):
+        fails(command("import", "npt", tmp_path, "--out", tmp_path / "x.zarr", "--local", "--set", given), 2, says)
+
+
+def test_s3_without_credentials_is_one_error(tmp_path: Path) -> None:
+    nothing = {
+        "AWS_ENDPOINT_URL": "http://127.0.0.1:9",
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "AWS_CONFIG_FILE": "/none",
+    }
+    made = command("generate", "--recipe", "smoke", "--out", "s3://bucket/x.zarr", "--local", **nothing)
+    fails(made, 1, "s3://bucket/x.zarr", "credentials")

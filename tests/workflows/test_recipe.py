@@ -102,3 +102,32 @@ def test_help_lists_every_key() -> None:
         return found
 
     assert leaves(yaml.safe_load(yaml.safe_dump(WorkflowRecipe().model_dump(mode="json")))) <= keys
+
+
+def test_relative_paths_are_those_beside_the_recipe_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "m.npz").write_bytes(b"")
+    (tmp_path / "r.yaml").write_text("data: {body: {family: smpl, path: m.npz}}")
+    recipe = load_recipe(str(tmp_path / "r.yaml"))
+    assert recipe.data.body.path == str(tmp_path / "m.npz")  # type: ignore[union-attr]
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
+    with pytest.raises(RecipeError, match=r"'m.npz' is a relative path.*name a full one"):
+        load_recipe(str(tmp_path / "r.yaml"))
+
+
+def test_a_folder_called_animals_is_not_mistaken_for_the_animals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "animals").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_recipe("animals-paper").data.body.path == "animals"  # type: ignore[union-attr]
+
+
+def test_a_key_may_count_the_entries_of_a_list(tmp_path: Path) -> None:
+    (tmp_path / "r.yaml").write_text("data: {body: {family: mixed, bodies: [{family: leg}, {family: leg, rings: 9}]}}")
+    recipe = load_recipe(str(tmp_path / "r.yaml"), ["data.body.bodies.1.rings=12"])
+    assert [body.rings for body in recipe.data.body.bodies] == [24, 12]  # type: ignore[union-attr]
+
+
+def test_a_dataset_of_nobody_is_refused() -> None:
+    with pytest.raises(RecipeError, match="training and evaluation are both 0"):
+        load_recipe("smoke", ["data.identities.training=0", "data.identities.evaluation=0"])
