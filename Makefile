@@ -26,7 +26,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster lint bench ui constraints clean
+.PHONY: help run test test-cluster lint bench bench-generation bench-networks bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -47,11 +47,16 @@ lint: $(READY) ## style, types, import rules
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-bench: $(READY) ## every benchmark in benchmarks/
-	@for file in benchmarks/*.py; do \
-	    [ -e "$$file" ] || { echo "benchmarks/ has no benchmark"; break; }; \
-	    echo "== $$file"; $(BIN)/python "$$file" || exit 1; \
-	done
+bench: bench-generation bench-networks ## every benchmark for a CPU
+
+bench-generation: $(READY) ## making meshes: ratios to NPT's way and to Anny's own forward pass
+	@$(BIN)/python -m benchmarks.generation $(ARGS)
+
+bench-networks: $(READY) ## the networks: fast against literal form, float32 and bfloat16, memory
+	@$(BIN)/python -m benchmarks.networks $(ARGS)
+
+bench-gpu: $(READY) ## DSFFNet on a GPU: fast against literal form, share of the chip's ceiling
+	@$(BIN)/python -m benchmarks.gpu $(ARGS)
 
 ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another port: UI_PORT=5001)
 	@[ -e $(OUT)/mlflow.db ] || { echo "$(OUT)/mlflow.db is not there yet: 'make run' makes it;" \
