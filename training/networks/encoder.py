@@ -39,9 +39,10 @@ class PoseEncoder(nn.Module):
     def forward(self, source: Tensor) -> Tensor:
         """Return ``[b, widths[-1]]`` for ``[b, n, 3]``."""
         last = self.last.weight
+        rounded = source.dtype == torch.float32 and torch.is_autocast_enabled(source.device.type)
         with full_precision(source):
             centred = self._before_last(source)
-            return torch.relu(_largest(last, centred) * deviation_after(last, centred))
+            return torch.relu(_largest(last, centred, rounded=rounded) * deviation_after(last, centred))
 
     def features(self, source: Tensor) -> Tensor:
         """Return ``[b, n, widths[-1]]``, of which `forward` is the maximum over the vertices."""
@@ -121,12 +122,19 @@ class _VarianceAfter(torch.autograd.Function):
         return (weighted * images).sum(dim=0), grad_centred
 
 
-def _largest(weight: Tensor, features: Tensor) -> Tensor:
-    """Return the maximum over the vertices of ``weight @ features``, ``[b, c]``, a few channels at a time."""
+def _largest(weight: Tensor, features: Tensor, *, rounded: bool = False) -> Tensor:
+    """Return the maximum over the vertices of ``weight @ features``, ``[b, c]``, a few channels at a time.
+
+    Where bfloat16 is asked for (`rounded`), it decides which vertex is the largest; the value is exact in any case.
+    """
+    meshes = features.shape[0]
     with torch.no_grad():
-        meshes, columns = features.shape[0], features.transpose(1, 2)
-        parts = [weight] if torch.compiler.is_compiling() else _parts(weight, meshes * features.shape[1])
-        index = torch.cat([torch.bmm(part.expand(meshes, -1, -1), columns).argmax(dim=2) for part in parts], dim=1)
+        rows, columns = weight, features.transpose(1, 2)
+        if rounded:
+            rows, columns = rows.bfloat16(), columns.bfloat16()
+        parts = [rows] if torch.compiler.is_compiling() else _parts(rows, meshes * features.shape[1])
+        # max, not argmax, which takes six times as long on a CPU
+        index = torch.cat([torch.bmm(part.expand(meshes, -1, -1), columns).max(dim=2).indices for part in parts], dim=1)
     mesh = torch.arange(meshes, device=features.device).unsqueeze(1)
     # Indexing, not gather: its derivative is deterministic on a GPU too.
     return (features[mesh, index] * weight).sum(dim=2)
