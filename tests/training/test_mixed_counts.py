@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from training.networks.dsffnet import DSFFNet
+from training.networks import build_network
 from training.networks.mixed_counts import MixedCounts
 
 COUNTS = ([40, 31, 40, 7], [25, 50, 25, 50])
@@ -19,13 +19,21 @@ def padded(counts: list[int], seed: int) -> torch.Tensor:
     return meshes
 
 
-@pytest.fixture
-def network() -> nn.Module:
+NETWORKS: dict[str, dict[str, object]] = {
+    "dsffnet": {"encoder_widths": (8, 16, 24), "decoder_widths": (16, 32, 16)},
+    "npt": {"encoder_widths": (8, 16, 29)},
+    "corenet3d": {"feature_widths": (8, 8, 16), "generator_widths": (32, 16, 16)},
+}
+
+
+@pytest.fixture(params=sorted(NETWORKS))
+def network(request: pytest.FixtureRequest) -> nn.Module:
     torch.manual_seed(0)
-    made = DSFFNet(encoder_widths=(8, 16, 24), decoder_widths=(16, 32, 16))
+    made = build_network(request.param, **NETWORKS[request.param]).eval()
     with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.copy_(torch.randn_like(parameter) * 0.3)
+        for name, parameter in made.named_parameters():
+            if "parametrizations" not in name:  # those are of spectral norms, whose buffers would no longer fit
+                parameter.copy_(torch.randn_like(parameter) * 0.3)
     return made
 
 
