@@ -173,9 +173,9 @@ class Decoder(nn.Module):
             first, second = block(active, vertices, probe)
             hidden = _joined(first, second, block.linear2.weight, following.weight)
             active = modulated_relu(hidden, vertices, *norm(probe))
-        first, second = self.block3(active, vertices, probe)
-        with full_precision(target):
-            return 2 * torch.tanh(self._lowered(first.to(target.dtype), second))
+        with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
+            first, second = self.block3(active, vertices, probe)
+            return 2 * torch.tanh(self._lowered(first, second))
 
     def _lifted(self, target: Tensor, vertices: Tensor, probe: Tensor) -> Tensor:
         """Return the first layer, FFAdaIN and ReLU: ``IN(h) sigma + mu`` is quadratic in the coordinates."""
