@@ -4,6 +4,8 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.errors import BodyError
+
 
 @dataclass(frozen=True)
 class Asset:
@@ -15,7 +17,19 @@ class Asset:
 
 
 def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
-    """A file as an asset, known by the sha256 of its bytes."""
-    with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    """A file as an asset, known by the sha256 of its bytes.
+
+    Raises
+    ------
+    BodyError
+        It cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise BodyError(
+            f"{path}, which the data is made from, cannot be read ({error.strerror or error}). Put it there, or name "
+            "another in the recipe"
+        ) from error
     return Asset(name or path.name, licence, f"sha256:{digest}")

@@ -4,7 +4,7 @@ Frame: metres, Y up, facing +Z, +X to the body's left, in the pose that the char
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 from pathlib import Path
@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from datagen.animals import LICENCE, animal_files, cache_folder
+from datagen.animals import LICENCE, SHA256, animal_files
 from datagen.assets import Asset, file_asset
 from datagen.errors import BodyError, RecipeError
-from datagen.gltf import SUFFIXES, Gltf
+from datagen.gltf import SUFFIXES, Gltf, reading
 from datagen.joint_names import pairs
 from datagen.joint_trees import Tree, joint_tree
 from datagen.keyframes import Clip, read_clips, world_frames
@@ -57,7 +57,7 @@ class Character:
     @property
     def assets(self) -> tuple[Asset, ...]:
         """The files that the character was read from."""
-        return tuple(file_asset(file, licence=_licence(file)) for file in self.file.files)
+        return tuple(_asset(file) for file in self.file.files)
 
     @cached_property
     def clips(self) -> dict[str, Clip]:
@@ -118,10 +118,8 @@ def load_character(path: Path) -> Character:
     BodyError
         The file is damaged, has no skin, more than one skeleton, or a surface that cannot be used.
     """
-    try:
+    with reading(path):
         return _character(Gltf(path))
-    except (LookupError, ValueError, TypeError, np.linalg.LinAlgError) as error:
-        raise BodyError(f"{path} is damaged ({type(error).__name__}: {error}). Export or copy it again") from error
 
 
 def _character(file: Gltf) -> Character:
@@ -197,13 +195,18 @@ def _axis_rotations() -> list[NDArray[np.float64]]:
 _AXIS_ROTATIONS = _axis_rotations()
 
 
-def _licence(file: Path) -> str:
-    return LICENCE if file.is_relative_to(cache_folder().absolute()) else "the file's own"
+def _asset(file: Path) -> Asset:
+    """A file, known by its bytes alone: the animals are CC0 wherever they lie, and nothing else is for lying there."""
+    asset = file_asset(file, licence="the file's own")
+    known = asset.version.removeprefix("sha256:") in SHA256.values()
+    return replace(asset, licence=LICENCE) if known else asset
 
 
 def _files(path: str) -> dict[str, Path]:
     """The characters' files by name."""
-    folder = animal_files() if path == ANIMALS else Path(path)
+    if path == ANIMALS:
+        return {file.stem: file.absolute() for file in animal_files()}
+    folder = Path(path)
     among = [folder] if folder.is_file() else sorted(folder.glob("*"))
     files = [each.absolute() for each in among if each.suffix.lower() in SUFFIXES]
     if not files:

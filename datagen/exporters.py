@@ -1,5 +1,6 @@
 """Datasets as mesh files: in the layout that peers' code trains on, or as folders for people to look through."""
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -9,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import DatasetError, RecipeError
+from datagen.errors import DatasetError, RecipeError, StorageError
 from datagen.grid import POSE_TYPES
 from datagen.mesh import Mesh, save_mesh, write_atomically
 from datagen.obj import face_lines, vertex_lines
@@ -64,8 +65,8 @@ def export_dataset(
     identities, poses
         Which ones, by number; without them all. An identity is written in those poses that it was made in.
     prefix
-        What file names begin with in the npt layouts: nothing for NPT's code, ``id`` for 3D-CoreNet's people,
-        ``toy_`` for its animals.
+        What file names begin with in the npt layouts, of letters, digits, _ and -: nothing for NPT's code, ``id`` for
+        3D-CoreNet's people, ``toy_`` for its animals.
     fresh
         Write every file again.
     progress
@@ -74,19 +75,30 @@ def export_dataset(
     Raises
     ------
     RecipeError
-        A layout, identity or pose that does not exist.
+        A layout, identity or pose that does not exist, or a prefix that is more than a piece of a file's name.
     DatasetError
-        The folder holds something other than an export of this dataset in this layout.
+        The folder is a file, or holds something other than an export of this dataset in this layout.
     StorageError
         A file could not be written, such as on a full disk; those that are there are whole.
     """
+    _require_prefix(prefix)
     if layout not in get_args(ExportLayout):
         raise RecipeError(f"no layout {layout!r} to export to; there are {', '.join(get_args(ExportLayout))}")
     place, names, cells = Path(folder), _Names(layout, prefix), _cells(dataset, identities, poses)
+    try:
+        return _export(dataset, place, names, progress(cells), fresh)
+    except (StorageError, PermissionError) as error:
+        raise StorageError(
+            f"{error}. What is there is whole: make room or choose another folder (--out), and run the same command "
+            "again to go on"
+        ) from error
+
+
+def _export(dataset: Dataset, place: Path, names: _Names, cells: Iterable[Cell], fresh: bool) -> int:
     _claim(place, _readme(dataset, names))
     topology = lru_cache(maxsize=1)(lambda identity: _Topology(dataset.faces(identity)))
     written = 0
-    for identity, pose in progress(cells):
+    for identity, pose in cells:
         path = place / names.of((identity, pose))
         if fresh or not path.exists():
             topology(identity).save(dataset.vertices(identity, pose), path)
@@ -133,6 +145,14 @@ def _require(what: str, numbers: Iterable[int], count: int) -> None:
             raise RecipeError(f"there is no {what} {number} to export; the dataset's are 0 to {count - 1}")
 
 
+def _require_prefix(prefix: str) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9_-]*", prefix):
+        raise RecipeError(
+            f"prefix {prefix!r} cannot begin the names of files: letters, digits, _ and - can. Choose another, such as "
+            "--prefix id"
+        )
+
+
 def _readme(dataset: Dataset, names: _Names) -> str:
     attributes = dataset.attributes
     return (
@@ -144,6 +164,8 @@ def _readme(dataset: Dataset, names: _Names) -> str:
 def _claim(place: Path, readme: str) -> None:
     """Make sure that whatever is in the folder is of this very export: files that are there are not written again."""
     said = place / "README.txt"
+    if place.exists() and not place.is_dir():
+        raise DatasetError(f"{place} is a file, and an export is a folder of files. Choose another: --out FOLDER")
     if place.is_dir() and any(not entry.name.startswith(".") for entry in place.iterdir()):
         if not said.is_file() or said.read_bytes() != readme.encode():
             raise DatasetError(

@@ -6,11 +6,11 @@ trimesh drops skins and clips, and what is needed here is small. Section numbers
 """
 
 import base64
-import binascii
 import json
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,26 @@ _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
+_LISTS = ("nodes", "accessors", "bufferViews", "buffers", "skins", "meshes", "animations")
+_LARGEST = 2**30  # bytes of an accessor; a million vertices' positions have 12 MB
+_DAMAGE = (
+    LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
+    np.linalg.LinAlgError,
+)  # fmt: skip
+
 Json = dict[str, Any]
+
+
+@contextmanager
+def reading(path: Path, part: str = "") -> Iterator[None]:
+    """Turn what Python raises on content that is not as the specification wants it into one BodyError."""
+    try:
+        yield
+    except _DAMAGE as error:
+        what = f"{part} cannot be read, " if part else ""
+        raise BodyError(
+            f"{path} is damaged ({what}{type(error).__name__}: {error}). Export or copy it again"
+        ) from error
 
 
 class Gltf:
@@ -43,7 +62,7 @@ class Gltf:
         self.path = path.absolute()
         self._binary: bytes | None = None
         self.json = self._parse()
-        packed = [name for name in self.json.get("extensionsRequired", ()) if "compression" in name]
+        packed = [str(name) for name in self.json.get("extensionsRequired", ()) if "compression" in str(name)]
         if packed:
             raise BodyError(f"{path} is packed with {packed[0]}. Export it again without compression")
 
@@ -54,12 +73,15 @@ class Gltf:
 
     @cached_property
     def parents(self) -> list[int]:
-        """Parent of each node; -1 for roots."""
-        parents = [-1] * len(self.nodes)
-        for number, node in enumerate(self.nodes):
-            for child in node.get("children", ()):
-                parents[child] = number
-        return parents
+        """Parent of each node; -1 for roots (3.5.2: nodes are trees)."""
+        with reading(self.path, "the tree of its nodes"):
+            parents = [-1] * len(self.nodes)
+            for number, node in enumerate(self.nodes):
+                for child in node.get("children", ()):
+                    if child < 0 or parents[child] >= 0:
+                        raise ValueError(f"node {child}, a child of node {number}, has another parent, or is none")
+                    parents[child] = number
+            return parents
 
     @cached_property
     def order(self) -> list[int]:
@@ -67,6 +89,9 @@ class Gltf:
         found = [number for number, parent in enumerate(self.parents) if parent < 0]
         for number in found:  # grows while it is read
             found += self.nodes[number].get("children", ())
+        if len(found) < len(self.nodes):
+            lost = min(set(range(len(self.nodes))) - set(found))
+            raise BodyError(f"{self.path} is damaged: node {lost} is its own ancestor. Export it again")
         return found
 
     @cached_property
@@ -95,13 +120,13 @@ class Gltf:
 
     def accessor(self, number: int) -> NDArray[Any]:
         """Elements [count, width] of an accessor (3.6.2): strided, sparse and normalised ones included."""
-        try:
+        with reading(self.path, f"accessor {number}"):
             return self._accessor(self.json["accessors"][number])
-        except (LookupError, ValueError, TypeError) as error:
-            raise BodyError(f"{self.path} is damaged: accessor {number} cannot be read ({error})") from error
 
     def _accessor(self, accessor: Json) -> NDArray[Any]:
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
+        if not 0 <= count * width * kind.itemsize <= _LARGEST:
+            raise ValueError(f"{count} elements are more than any character has")
         values = np.zeros((count, width), kind)
         if "bufferView" in accessor:
             values = self._elements(accessor["bufferView"], accessor.get("byteOffset", 0), kind, count, width)
@@ -149,8 +174,9 @@ class Gltf:
     @property
     def files(self) -> list[Path]:
         """The file itself, and those beside it that hold its buffers."""
-        uris = [buffer.get("uri", "data:") for buffer in self.json.get("buffers", ())]
-        return [self.path, *(self._beside(uri) for uri in uris if not uri.startswith("data:"))]
+        with reading(self.path, "the list of its buffers"):
+            uris = [buffer.get("uri", "data:") for buffer in self.json.get("buffers", ())]
+            return [self.path, *(self._beside(uri) for uri in uris if not uri.startswith("data:"))]
 
     def _beside(self, uri: str) -> Path:
         beside = Path(os.path.normpath(self.path.parent / unquote(uri)))
@@ -164,10 +190,14 @@ class Gltf:
             parsed = json.loads(self._json_chunk(content) if content[:4] == b"glTF" else content)
             if str(parsed["asset"]["version"]).split(".")[0] != "2":
                 raise ValueError(f"glTF version {parsed['asset']['version']}")
+            for name in _LISTS:
+                its = parsed.get(name, [])
+                if not isinstance(its, list) or not all(isinstance(each, dict) for each in its):
+                    raise ValueError(f"{name} is not a list of objects")
             return parsed
         except OSError as error:
             raise BodyError(f"{self.path} cannot be read: {error.strerror}") from error
-        except (ValueError, LookupError, TypeError, struct.error, binascii.Error) as error:
+        except _DAMAGE as error:
             raise BodyError(f"{self.path} is not a sound glTF 2.0 file ({error}). Export or copy it again") from error
 
     def _json_chunk(self, content: bytes) -> bytes:

@@ -94,7 +94,7 @@ def require_files(recipe: DatasetRecipe) -> None:
     RecipeError
         More identities or poses are asked for than there are.
     BodyError
-        A file is missing; the message names it.
+        A file is missing, which the message names, or the test list cannot be used.
     """
     bodies = recipe.body.bodies if isinstance(recipe.body, MixedBody) else (recipe.body,)
     grid = Grid(recipe)
@@ -102,6 +102,8 @@ def require_files(recipe: DatasetRecipe) -> None:
         if isinstance(body, ImportedBody):
             its = range(place, grid.identity_count, len(bodies))  # identities of a mixed body take turns
             _require_cells(find_meshes(body), [grid.poses_of(identity).tolist() for identity in its])
+    if isinstance(recipe.body, ImportedBody) and recipe.body.test_list:
+        evaluation_lists(grid)
 
 
 def _require_cells(meshes: FoundMeshes, poses: list[list[int]]) -> None:

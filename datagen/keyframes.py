@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datagen.errors import BodyError
-from datagen.gltf import Gltf
+from datagen.gltf import Gltf, reading
 
 _CUBIC, _STEP = "CUBICSPLINE", "STEP"
 
@@ -60,7 +60,10 @@ def read_clips(file: Gltf) -> dict[str, Clip]:
     BodyError
         Keyframes that are damaged.
     """
-    clips = [_clip(file, number, animation) for number, animation in enumerate(file.json.get("animations", ()))]
+    clips = []
+    for number, animation in enumerate(file.json.get("animations", ())):
+        with reading(file.path, f"animation {number}"):
+            clips.append(_clip(file, number, animation))
     return {clip.name: clip for clip in clips if clip.rotations}
 
 
@@ -92,10 +95,12 @@ def _clip(file: Gltf, number: int, animation: dict[str, Any]) -> Clip:
     for channel in animation["channels"]:
         target = channel["target"]
         if target["path"] == "rotation" and "node" in target:
+            if not 0 <= target["node"] < len(file.nodes):
+                raise ValueError(f"there is no node {target['node']}")
             tracks[target["node"]] = _track(file, animation["samplers"][channel["sampler"]])
     start = min((track.times[0] for track in tracks.values()), default=0.0)
     end = max((track.times[-1] for track in tracks.values()), default=0.0)
-    return Clip(animation.get("name") or f"clip{number}", float(start), float(end), tracks)
+    return Clip(str(animation.get("name") or f"clip{number}"), float(start), float(end), tracks)
 
 
 def _track(file: Gltf, sampler: dict[str, Any]) -> Track:
@@ -103,7 +108,12 @@ def _track(file: Gltf, sampler: dict[str, Any]) -> Track:
     times = file.accessor(sampler["input"])[:, 0].astype(np.float64)
     values = file.accessor(sampler["output"]).astype(np.float64)
     shape = (len(times), 3, 4) if interpolation == _CUBIC else (len(times), 4)
-    if not len(times) or values.size != np.prod(shape) or (np.diff(times) <= 0).any():
+    if (
+        not np.isfinite(times).all()
+        or not len(times)
+        or values.size != np.prod(shape)
+        or not (np.diff(times) > 0).all()
+    ):
         raise BodyError(f"{file.path}: an animation's keyframes are damaged. Export it again")
     return Track(times, values.reshape(shape), interpolation)
 

@@ -168,20 +168,26 @@ def _natural(name: str) -> tuple[int, str]:
 
 
 def _chosen(asked: Iterable[int | str], there: list[str], *, what: str, folder: Path) -> tuple[str, ...]:
-    names = [name for each in asked for name in _run(str(each), there)]
-    for name in names:
-        if name not in there:
+    known, names = set(there), dict[str, None]()
+    for name in (name for each in asked for name in _run(str(each), known, what)):
+        if name not in known:
             raise BodyError(f"{what}: {folder} has none called {name}; it has {_few(there)}")
-        if names.count(name) > 1:
+        if name in names:
             raise BodyError(f"{what}: {name} is named twice")
+        names[name] = None
     return tuple(names or there)
 
 
-def _run(text: str, there: list[str]) -> list[str]:
+def _run(text: str, known: set[str], what: str) -> Iterator[str]:
     """A run of numbers such as 16-29, or one name."""
-    if text not in there and (match := re.fullmatch(r"(\d+)-(\d+)", text)):
-        return [str(number) for number in range(int(match[1]), int(match[2]) + 1)]
-    return [text]
+    match = re.fullmatch(r"([0-9]{1,9})-([0-9]{1,9})", text)
+    if text in known or not match:
+        yield text
+        return
+    first, last = int(match[1]), int(match[2])
+    if first > last:
+        raise BodyError(f"{what}: the run {text} is empty, as {first} is more than {last}. Write it {last}-{first}")
+    yield from map(str, range(first, last + 1))
 
 
 def _few(names: list[str]) -> str:

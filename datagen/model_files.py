@@ -7,6 +7,7 @@ anything in them (:mod:`datagen.unpickling`).
 """
 
 import io
+import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.archives import FAULTS, array_header, reason
 from datagen.errors import BodyError
 from datagen.mesh import write_atomically
-from datagen.unpickling import array_of, unpickle
+from datagen.recorded_arrays import array_of, require_size
+from datagen.unpickling import unpickle
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 NOTE = "note"  # what a licence-free stand-in says of itself
@@ -74,16 +77,17 @@ def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(path) as archive:
             members = set(archive.namelist())
             return {key: _read_member(archive, key, path) for key in keys if f"{key}.npy" in members}
-    except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile) as error:
-        raise BodyError(f"{path} is damaged ({error}); copy or download it again") from error
+    except FAULTS as error:
+        raise BodyError(f"{path} is damaged ({reason(error)}); copy or download it again") from error
 
 
 def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
     """One array; one of Python objects, as np.savez makes of a sparse matrix, goes through our own unpickling."""
+    require_size(archive.getinfo(f"{key}.npy").file_size, name=f"{key!r} in {path}")
     content = io.BytesIO(archive.read(f"{key}.npy"))
-    version = np.lib.format.read_magic(content)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    if header(content)[2].hasobject:
+    shape, kind = array_header(content)
+    require_size(math.prod(shape) * kind.itemsize, name=f"{key!r} in {path}")
+    if kind.hasobject:
         return array_of(unpickle(content, name=f"{key!r} in {path}"), name=f"{key!r} in {path}")
     content.seek(0)
     return np.lib.format.read_array(content, allow_pickle=False)

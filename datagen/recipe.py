@@ -234,10 +234,11 @@ class AmassPoses(Frozen):
     name: Literal["amass"] = "amass"
     path: str = Field("", description="a motion file, or a folder that is searched for them")
     held_out: float = Field(
-        0.0,
+        0.2,
         ge=0,
         lt=1,
-        description="share of the files that unseen poses, and only they, are taken from; 0: all share all",
+        description="share of the files that unseen poses, and only they, are taken from; 0: all share all, and an "
+        "unseen pose may be a neighbouring frame, hardly another, of a seen one",
     )
     root: Literal["keep", "upright", "drop"] = Field(
         "upright",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.assets import Asset, file_asset
-from datagen.errors import BodyError
+from datagen.errors import BodyError, MeshError
 from datagen.layouts import FoundMeshes, find_meshes
 from datagen.mesh import Mesh, load_mesh
 from datagen.poses import Poses
@@ -21,6 +21,7 @@ from datagen.poses.files import NUMBER
 from datagen.recipe import Axis, ImportedBody
 
 _LICENCE = "as the files' owner states"
+_CHOOSE = "--set 'data.body.identities=[...]' or --set 'data.body.poses=[...]'"
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 
@@ -80,32 +81,40 @@ class ImportedModel:
 
     def _read_first(self, identity: int) -> Mesh:
         path = self._meshes.first_path(identity)
-        mesh = load_mesh(path)
+        mesh = _load(path)
         loose = len(mesh.vertices) - 1 - int(mesh.faces.max())
         if loose:
             raise BodyError(
                 f"{path}: its last {loose} vertices are in no face, and a dataset counts vertices by its faces. "
-                "Save the identity's meshes without them"
+                f"Save the identity's meshes without them, or choose others: {_CHOOSE}"
             )
         return mesh
 
     def _read(self, path: Path, first: Mesh) -> Mesh:
-        mesh = load_mesh(path)
+        mesh = _load(path)
         if len(mesh.vertices) != len(first.vertices):
             raise BodyError(
                 f"{path} has {len(mesh.vertices)} vertices, the identity's first file {len(first.vertices)}. "
-                "All poses of an identity share vertices and faces: mend the file, or leave its pose out"
+                "All poses of an identity share vertices and faces: mend the file, or leave out its pose or identity: "
+                f"{_CHOOSE}"
             )
         if not np.array_equal(mesh.faces, first.faces):
             raise BodyError(
                 f"{path} has other faces than the identity's first file. All poses of an identity share vertices and "
-                "faces: mend the file, or leave its pose out"
+                f"faces: mend the file, or leave out its pose or identity: {_CHOOSE}"
             )
         return mesh
 
     def _in_our_frame(self, mesh: Mesh) -> NDArray[np.float64]:
         columns, signs = frame(self._recipe.up, self._recipe.forward)
         return mesh.vertices[:, columns] * (signs * self._recipe.unit)
+
+
+def _load(path: Path) -> Mesh:
+    try:
+        return load_mesh(path)
+    except MeshError as error:
+        raise MeshError(f"{error}. Mend the file, or leave out its pose or identity: {_CHOOSE}") from error
 
 
 def frame(up: Axis, forward: Axis) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

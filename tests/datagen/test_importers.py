@@ -123,6 +123,8 @@ def test_other_files_and_folders_are_passed_over(tmp_path: Path) -> None:
         ({"identities": [0, 7]}, "data.body.identities: .* has none called 7; it has 0, 1"),
         ({"identities": ["0-1", 1]}, "data.body.identities: 1 is named twice"),
         ({"poses": ["1-9"]}, "data.body.poses: .* has none called 2"),
+        ({"poses": ["0-999999999"]}, "data.body.poses: .* has none called 2"),
+        ({"identities": ["1-0"]}, r"data.body.identities: the run 1-0 is empty.* Write it 0-1"),
     ],
 )
 def test_what_is_not_there(tmp_path: Path, options: dict[str, Any], message: str) -> None:
@@ -175,3 +177,13 @@ def test_listed_triples_of_a_recipe(tmp_path: Path) -> None:
     assert listed_triples(ImportedBody(path=str(folder))) is None
     with pytest.raises(BodyError, match=r"test list .* cannot be read"):
         listed_triples(ImportedBody(path=str(folder), test_list=str(tmp_path / "none.txt")))
+
+
+@pytest.mark.parametrize("name", ["none.txt", "files", "latin.txt"])
+def test_a_test_list_that_cannot_be_read_is_named_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    folder = npt_folder(tmp_path / "files", identities=range(4), poses=range(4))
+    (tmp_path / "latin.txt").write_bytes(b"\xe4\xff")
+    recipe = found_recipe("npt", folder, test_list=str(tmp_path / name))
+    with pytest.raises(BodyError, match=rf"the test list .*{name} cannot be read .*--set data.body.test_list=FILE"):
+        generate(recipe, str(tmp_path / "out.zarr"))
+    assert not (tmp_path / "out.zarr").exists()

@@ -7,6 +7,7 @@ import pickle
 import pickletools
 import struct
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ import scipy.sparse
 
 from datagen.errors import BodyError
 from datagen.model_files import read_arrays
-from datagen.unpickling import Recorded, array_of, unpickle
+from datagen.recorded_arrays import array_of
+from datagen.unpickling import Recorded, unpickle
+from tests.support.archives import DAMAGES
 from tests.support.models import fake_chumpy
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
@@ -241,3 +244,63 @@ def test_object_members_of_npz_go_the_same_way(tmp_path: Path) -> None:
     with pytest.raises(BodyError, match=r"'joint2num' in .*m\.npz was not loaded: .*\.system"):
         read_arrays(tmp_path / "m.npz", ("joint2num",))
     assert not mark.exists()
+
+
+def _shared(depth: int, *, chumpy: bool) -> bytes:
+    """A pickle of a list of eight times the same, of which each is a list of eight times the same ..."""
+    with fake_chumpy() as (ch, _):
+        value: Any = 1.5
+        for _ in range(depth):
+            value = [value] * 8
+            if chumpy:
+                held = ch.__new__(ch)
+                held.__dict__.update(x=value)
+                value = held
+        return pickle.dumps(value)
+
+
+def _sparse_of_shape(*shape: int) -> bytes:
+    matrix = scipy.sparse.csc_matrix(np.eye(3))
+    matrix._shape = shape
+    return pickle.dumps(matrix)
+
+
+LARGE = {
+    "shared objects": lambda: _shared(15, chumpy=True),
+    "shared lists": lambda: _shared(15, chumpy=False),
+    "a sparse matrix of 1e14 numbers": lambda: _sparse_of_shape(10**7, 10**7),
+    "a sparse matrix that repeats": lambda: pickle.dumps(_corrupt(scipy.sparse.csr_matrix(np.eye(3)), "indptr", 10**9)),
+    "a hundred large sparse matrices": lambda: pickle.dumps([pickle.loads(_sparse_of_shape(5000, 1000))] * 100),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(LARGE))
+def test_few_bytes_that_stand_for_many_are_refused_at_once(kind: str) -> None:
+    content = LARGE[kind]()
+    assert len(content) < 10_000
+    started = time.perf_counter()
+    with pytest.raises(BodyError, match=r"'x' in model\.pkl is not an array of numbers: (it takes .* GiB|the rows)"):
+        array(content)
+    assert time.perf_counter() - started < 5
+
+
+def test_what_is_named_often_is_worked_out_once() -> None:
+    assert array(_shared(5, chumpy=True)).shape == (8,) * 5
+    assert array(pickle.dumps([[1, 2, 3]] * 50_000)).shape == (50_000, 3)
+
+
+def test_headers_that_promise_more_than_a_body_model_has(tmp_path: Path) -> None:
+    content = io.BytesIO()
+    np.savez(content, f=np.zeros((50, 66)))
+    (tmp_path / "m.npz").write_bytes(DAMAGES["a header of 1e13 rows"](content.getvalue()))
+    with pytest.raises(BodyError, match=r"'f' in .*m\.npz is not of a body model: it would take 4.92e\+06 GiB"):
+        read_arrays(tmp_path / "m.npz", ("f",))
+
+
+@pytest.mark.parametrize("damage", sorted(set(DAMAGES) - {"a header of 1e13 rows", "cut off"}))
+def test_damaged_archives_are_one_error(tmp_path: Path, damage: str) -> None:
+    content = io.BytesIO()
+    np.savez_compressed(content, f=np.random.default_rng(0).normal(size=(50, 3)))
+    (tmp_path / "m.npz").write_bytes(DAMAGES[damage](content.getvalue()))
+    with pytest.raises(BodyError, match=r"m\.npz is damaged \(.+\); copy or download it again"):
+        read_arrays(tmp_path / "m.npz", ("f",))

@@ -11,6 +11,6 @@ from datagen.errors import DsffnetError
 def require_animals() -> Path:
     """Their folder; the test is skipped where they are neither cached nor to be had."""
     try:
-        return animal_files()
+        return animal_files()[0].parent
     except DsffnetError as error:
         pytest.skip(f"no animals: {error}")
