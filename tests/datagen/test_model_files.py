@@ -11,9 +11,9 @@ from datagen.bodies.smpl import SmplModel
 from datagen.errors import BodyError
 from datagen.model_files import KEYS, convert_model
 from datagen.model_search import FOLDER_VARIABLE, find_model
-from datagen.poses import PARENTS
+from datagen.poses import PARENTS, draw_poses
 from datagen.random import Stream, generator
-from datagen.recipe import SmplBody
+from datagen.recipe import PoseRecipe, SmplBody
 from tests.support.models import Arrays, arrays_of, random_model, save_npz, save_pickle, tree
 
 
