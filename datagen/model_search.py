@@ -54,7 +54,7 @@ FAMILIES = {
         "https://smal.is.tue.mpg.de",
         (r"smal(?!.*data).*", r"my_smpl_.*"),
         "smal_CVPR2017.npz, smal_CVPR2017.pkl, my_smpl_*.pkl",
-        _STAND_IN.format(body="animals: --set data.body.family=rigged", model="smal"),
+        _STAND_IN.format(body="animals: --recipe animals-paper", model="smal"),
     ),
 }
 

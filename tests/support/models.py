@@ -14,6 +14,8 @@ import torch
 from numpy.typing import NDArray
 from smplx.lbs import lbs
 
+from datagen.poses import PARENTS
+
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -40,6 +42,19 @@ def random_model(parents: tuple[int, ...], *, vertices: int = 150, betas: int = 
         "kintree_table": np.array([[2**32 - 1, *parents[1:]], range(count)], np.uint32),
         "f": np.stack([np.arange(vertices), np.arange(1, vertices + 1), np.arange(2, vertices + 2)], 1) % vertices,
     }
+
+
+def tree(model: str) -> tuple[int, ...]:
+    """Parents in SMPL's, SMPL-H's and SMPL-X' files."""
+    hands = {"smpl": [], "smplh": [(20, 22), (21, 37)], "smplx": [(20, 25), (21, 40)]}[model]
+    parents = [*PARENTS[:22], *([15, 15, 15] if model == "smplx" else [])]
+    for wrist, first in hands:
+        parents += [parent for n in range(first, first + 15, 3) for parent in (wrist, n, n + 1)]
+    return tuple(parents) if hands else PARENTS
+
+
+def arrays_of(model: str) -> Arrays:
+    return random_model(tree(model), betas=20 if model == "smplx" else 10)
 
 
 def reference(arrays: Arrays, betas: NDArray[np.float64], rotations: NDArray[np.float64]) -> NDArray[np.float64]:

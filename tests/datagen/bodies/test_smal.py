@@ -130,7 +130,10 @@ def test_identities_of_families_scatter_around_their_means(animal: Path, tmp_pat
 
 def test_files_that_do_not_fit_are_refused(animal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
-    with pytest.raises(BodyError, match=r"https://smal\.is\.tue\.mpg\.de.*dsffnet stand-in smal --out smal\.npz"):
+    with pytest.raises(
+        BodyError,
+        match=r"https://smal\.is\.tue\.mpg\.de.*--recipe animals-paper.*dsffnet stand-in smal --out smal\.npz",
+    ):
         SmalModel(SmalBody(path=str(tmp_path)))
     person = save_npz(tmp_path / "smal_person.npz", random_model(SMAL_PARENTS[:24]))
     with pytest.raises(BodyError, match="24 joints, but SMAL has 33 to 35"):
