@@ -16,6 +16,7 @@ from training.networks.modulation import (
     pose_probe,
     with_zero_gradients,
 )
+from training.networks.rounding import centred_for_autocast
 from training.networks.shapes import check_vertices
 
 
@@ -122,7 +123,10 @@ class DSFFNet(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """FFAdaIN, ReLU and linear layer, twice; the two results are added."""
+    """FFAdaIN, ReLU and linear layer, twice; the two results are added.
+
+    Under autocast the result is right but for a constant in each channel, which the norm that follows takes away.
+    """
 
     def __init__(self, width: int, latent: int, feature_fusion: bool, target_side: bool) -> None:
         super().__init__()
@@ -136,8 +140,8 @@ class ResidualBlock(nn.Module):
 
         The rest is left to what follows the block, which has cheaper ways of doing it (see `_joined`).
         """
-        first = nn.functional.linear(active, self.linear1.weight)
-        return first, modulated_relu(first, vertices, *self.norm2(probe))
+        first = nn.functional.linear(centred_for_autocast(active), self.linear1.weight)
+        return first, centred_for_autocast(modulated_relu(first, vertices, *self.norm2(probe)))
 
 
 class Decoder(nn.Module):
