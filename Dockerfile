@@ -22,7 +22,7 @@ COPY pyproject.toml constraints.txt LICENSE README.md ./
 COPY deploy/requirements.txt deploy/
 RUN mkdir datagen training workflows && touch datagen/__init__.py training/__init__.py workflows/__init__.py \
     && pip install --constraint constraints.txt ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} \
-        --requirement deploy/requirements.txt --editable .
+        --requirement deploy/requirements.txt --editable ".[s3]"
 
 COPY --chown=dsffnet:dsffnet . .
 
