@@ -26,7 +26,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster lint bench bench-generation bench-networks bench-gpu ui constraints clean
+.PHONY: help run test test-cluster test-slow lint bench bench-generation bench-networks bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -40,6 +40,9 @@ test: $(READY) ## the test suite
 
 test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a job submitted to them
 	@$(BIN)/python -m pytest -m cluster $(ARGS)
+
+test-slow: $(READY) ## every rig and topology of Anny, the real animals (fetched once), torch.compile: some ten minutes
+	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 lint: $(READY) ## style, types, import rules
 	@$(BIN)/ruff check .
