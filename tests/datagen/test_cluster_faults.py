@@ -29,12 +29,12 @@ ROOT = Path(__file__).parents[2]
 
 
 def many_shards() -> DatasetRecipe:
-    """96 shards of some milliseconds each, so that there is time to kill something in the middle."""
+    """384 shards of some milliseconds each, so that there is time to kill something in the middle."""
     return tiny_dataset(
         body={"family": "leg", "rings": 120, "segments": 60},
         poses={"seen": 96, "unseen": 48},
         identities={"training": 6, "evaluation": 4},
-        store={"poses_per_shard": 12},
+        store={"poses_per_shard": 3},
     )
 
 
@@ -115,7 +115,7 @@ def test_loss_of_a_node(undisturbed: Path, tmp_path: Path) -> None:
         cluster.wait_for_nodes()
         driver = start_driver(url, FAULT_ADDRESS=cluster.address)
         wait_for(lambda: shard_count(url) >= 12)
-        assert shard_count(url) < 96, "work is left when the node goes"
+        assert shard_count(url) < 384, "work is left when the node goes"
         cluster.remove_node(lost, allow_graceful=False)
         assert driver.wait(200) == 0
     finally:
