@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.peak_memory import forget_peak, peak_mebibytes
-from training.acceleration import Precision, precision
+from training.acceleration import Precision, autocast, precision, products
 from training.losses import pose_transfer_loss
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
@@ -134,9 +134,10 @@ def step(
 ) -> None:
     """One training step."""
     optimiser.zero_grad(set_to_none=True)
-    with precision(how, source.device):
-        prediction = network(source=source, target=target)
-    pose_transfer_loss(prediction, truth, edges)[0].backward()
+    with products(how):
+        with autocast(how, source.device):
+            prediction = network(source=source, target=target)
+        pose_transfer_loss(prediction, truth, edges)[0].backward()
     optimiser.step()
 
 

@@ -24,20 +24,33 @@ def precision(name: Precision, device: torch.device) -> Iterator[None]:
     device
         Where the block runs.
     """
-    before = torch.get_float32_matmul_precision()
+    with products(name), autocast(name, device):
+        yield
+
+
+@contextlib.contextmanager
+def products(name: Precision) -> Iterator[None]:
+    """Whether float32 products may use TF32, in the block and in a backward pass within it."""
+    before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
     torch.set_float32_matmul_precision("high" if name == "tf32" else "highest")
+    torch.backends.cudnn.allow_tf32 = name == "tf32"
     try:
-        with torch.autocast(device.type, torch.bfloat16, enabled=name == "bfloat16"):
-            yield
+        yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision(before[0])
+        torch.backends.cudnn.allow_tf32 = before[1]
+
+
+def autocast(name: Precision, device: torch.device, *, cached: bool = True) -> torch.autocast:
+    """Autocast for a forward pass; its backward pass runs outside, in the same precisions."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=name == "bfloat16", cache_enabled=cached)
 
 
 class GraphedTransfer:
     """A network for inference whose kernel launches are recorded once for each shape and then replayed together.
 
     For single pairs a GPU waits for Python most of the time; a CUDA graph takes that away. On a CPU the network is
-    simply called.
+    simply called. Not for several threads or streams at once: inputs and output of a graph have one place in memory.
 
     Parameters
     ----------
@@ -51,22 +64,28 @@ class GraphedTransfer:
 
     def __init__(self, network: nn.Module, *, precision: Precision = "float32", kept: int = 8) -> None:
         self._network, self._precision, self._kept = network.eval(), precision, kept
-        self._graphs: dict[tuple[torch.Size, torch.Size], _Graph] = {}
+        self._graphs: dict[tuple[object, ...], _Graph] = {}
 
     @torch.no_grad()
     def __call__(self, *, source: Tensor, target: Tensor) -> Tensor:
         """Return ``[b, n_target, 3]`` for ``[b, n_source, 3]`` and ``[b, n_target, 3]``."""
         if source.device.type != "cuda":
             return self._run(source, target)
-        shapes = (source.shape, target.shape)
-        if shapes not in self._graphs:
-            if len(self._graphs) >= self._kept:
-                self._graphs.pop(next(iter(self._graphs)))
-            self._graphs[shapes] = _Graph(self._run, source, target)
-        return self._graphs[shapes].replay(source, target)
+        if source.device != target.device:
+            raise ValueError(f"source is on {source.device}, target on {target.device}")
+        kind = (source.shape, target.shape, source.dtype, target.dtype, source.device)
+        graph = self._graphs.pop(kind, None)
+        if graph is None:
+            with torch.cuda.device(source.device), torch.inference_mode(False):
+                graph = _Graph(self._run, source, target)
+        self._graphs[kind] = graph  # the latest is last
+        while len(self._graphs) > self._kept:
+            self._graphs.pop(next(iter(self._graphs)))
+        return graph.replay(source, target)
 
     def _run(self, source: Tensor, target: Tensor) -> Tensor:
-        with precision(self._precision, source.device):
+        # without the cache of rounded weights: a graph would go on reading it after it is gone
+        with products(self._precision), autocast(self._precision, source.device, cached=False):
             return cast(Tensor, self._network(source=source, target=target))
 
 

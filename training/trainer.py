@@ -16,7 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from datagen.errors import DsffnetError
 from datagen.store import Dataset, open_dataset
-from training.acceleration import precision
+from training.acceleration import autocast, products
 from training.checkpoint import CheckpointError, load_checkpoint, read_checkpoint, save_checkpoint
 from training.data import TripleOrder, VertexBank, read_batch
 from training.inference import network_from, predict
@@ -128,10 +128,13 @@ class _Trainer:
         with meter.waiting():
             batch = self.bank.batch(triples)
         self.optimiser.zero_grad(set_to_none=True)
-        with precision(self.recipe.precision, self.device):
-            prediction = self.model(source=batch.source, target=batch.target)
-        loss, terms = pose_transfer_loss(prediction, batch.truth, self.bank.edges, edge_weight=self.recipe.edge_weight)
-        loss.backward()  # type: ignore[no-untyped-call]
+        with products(self.recipe.precision):
+            with autocast(self.recipe.precision, self.device):
+                prediction = self.model(source=batch.source, target=batch.target)
+            loss, terms = pose_transfer_loss(
+                prediction, batch.truth, self.bank.edges, edge_weight=self.recipe.edge_weight
+            )
+            loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))
         rate = self.schedule.get_last_lr()[0]
         self._agree_to_go_on(loss, norm, triples)

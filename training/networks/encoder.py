@@ -11,7 +11,10 @@ from torch.autograd.function import once_differentiable
 from training.networks.modulation import VARIANCE_FLOOR, full_precision
 
 ARGMAX_ELEMENTS = 2**20
-"""Elements of the last layer held at a time while its largest values are searched."""
+"""On a CPU, elements of the last layer held at a time while its largest values are searched, to stay in cache."""
+
+ARGMAX_ELEMENTS_ELSEWHERE = 2**28
+"""The same on a GPU, where a few large products are better than many thin ones."""
 
 
 class PoseEncoder(nn.Module):
@@ -141,5 +144,6 @@ def _largest(weight: Tensor, features: Tensor, *, rounded: bool = False) -> Tens
 
 
 def _parts(weight: Tensor, columns: int) -> list[Tensor]:
-    rows = max(1, ARGMAX_ELEMENTS // columns)
+    elements = ARGMAX_ELEMENTS if weight.device.type == "cpu" else ARGMAX_ELEMENTS_ELSEWHERE
+    rows = max(1, elements // columns)
     return [weight[start : start + rows] for start in range(0, weight.shape[0], rows)]

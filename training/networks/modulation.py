@@ -6,6 +6,7 @@ Shapes: ``b`` meshes, ``n`` vertices, ``c`` channels; arrays are channels-last. 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -25,9 +26,19 @@ def homogeneous(coordinates: Tensor) -> Tensor:
     return nn.functional.pad(coordinates, (0, 1), value=1.0)
 
 
-def full_precision(array: Tensor) -> torch.autocast:
-    """Return a context without the ambient autocast: norms, coordinates and poses do not bear bfloat16."""
-    return torch.autocast(array.device.type, enabled=False)
+@contextlib.contextmanager
+def full_precision(array: Tensor) -> Iterator[None]:
+    """Without the ambient autocast and TF32: norms, coordinates and poses do not bear them."""
+    with torch.autocast(array.device.type, enabled=False):
+        if torch.compiler.is_compiling() or torch.get_float32_matmul_precision() == "highest":
+            yield
+            return
+        before = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("highest")
+        try:
+            yield
+        finally:
+            torch.set_float32_matmul_precision(before)
 
 
 class FFAdaIN(nn.Module):
