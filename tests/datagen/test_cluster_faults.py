@@ -42,7 +42,7 @@ def shard_count(url: Path) -> int:
     return len(list(url.rglob("vertices/c/*/0/0")))
 
 
-def wait_for(condition: object, *, seconds: float = 60) -> None:
+def wait_for(condition: object, *, seconds: float = 150) -> None:
     assert callable(condition)
     end = time.monotonic() + seconds
     while not condition():

@@ -47,7 +47,7 @@ def longer(out: Path) -> tuple[str, ...]:
     return ("--set", *LONGER)
 
 
-def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120) -> None:
+def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 200) -> None:
     until = time.monotonic() + seconds
     while not happened():
         assert process.poll() is None, f"ended before the moment to kill it:\n{process.stdout.read()}"  # type: ignore[union-attr]
