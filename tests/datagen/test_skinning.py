@@ -48,7 +48,7 @@ def test_it_is_linear_blend_skinning(size: float, corrected: bool) -> None:
     correctives = 0.05 * np.random.default_rng(2).normal(size=(5, 50, 3)) * corrected
     expected = literally(body, world, correctives)
     found = skin(body, world, correctives if corrected else None)
-    assert np.abs(found - expected).max() < 1e-5 * max(1, size)
+    assert np.abs(found - expected).max() < (3e-6 if size <= 1 else 1e-5 * size)  # beyond 4 m the steps are wider
 
 
 def test_many_poses_are_what_single_ones_are() -> None:
