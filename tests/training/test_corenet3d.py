@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
-import torch.distributed as dist
 from literal_corenet3d import LiteralCoreNet3D, literal_transport
+from one_rank import two_backward_passes
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
@@ -278,18 +277,8 @@ def test_every_parameter_receives_a_gradient_and_dead_biases_receive_zero() -> N
     assert zero == {f"{layer}.bias" for layer in layers}
 
 
-@pytest.fixture
-def _group() -> Iterator[None]:
-    dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
-    yield
-    dist.destroy_process_group()
-
-
-@pytest.mark.usefixtures("_group")
 def test_distributed_data_parallel_needs_no_search_for_unused_parameters() -> None:
-    network = nn.parallel.DistributedDataParallel(_network())
-    for _ in range(2):  # a parameter without gradient raises at the second forward
-        network(**_inputs()).sum().backward()
+    two_backward_passes(_network(), _inputs())
 
 
 def test_spectral_norm_holds_still_in_evaluation_and_closes_in_on_one_in_training() -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.distributed as dist
 from literal_dsffnet import LiteralDSFFNet
+from one_rank import two_backward_passes
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -179,13 +179,7 @@ def test_every_parameter_receives_a_gradient_and_dead_biases_receive_zero(option
 
 
 def test_distributed_data_parallel_needs_no_search_for_unused_parameters() -> None:
-    dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
-    try:
-        network = nn.parallel.DistributedDataParallel(_network())
-        for _ in range(2):  # a parameter without gradient raises at the second forward
-            network(source=_mesh(30), target=_mesh(25, seed=2)).sum().backward()
-    finally:
-        dist.destroy_process_group()
+    two_backward_passes(_network(), {"source": _mesh(30), "target": _mesh(25, seed=2)})
 
 
 def test_under_autocast_the_result_stays_close_and_float32() -> None:
