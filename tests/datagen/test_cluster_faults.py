@@ -68,7 +68,8 @@ generate(many_shards(), sys.argv[1], run=ray_runner)
 
 
 def start_driver(url: Path, **environment: str) -> subprocess.Popen[bytes]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    # RAY_AUTH_MODE stays: a cluster of this process has it, and refuses a driver that does not
+    kept = {n: value for n, value in os.environ.items() if not n.startswith("RAY_") or n == "RAY_AUTH_MODE"}
     command = [sys.executable, "-c", _DRIVER, str(url)]
     return subprocess.Popen(command, cwd=ROOT, env={**kept, "PYTHONPATH": str(ROOT), **environment})
 
