@@ -53,7 +53,9 @@ class DSFFNet(nn.Module):
     together are a quadratic function of the coordinates; the second convolution of a block that narrows is merged with
     the next one; a bias before an instance norm cancels (its gradient is exactly zero).
 
-    Under autocast only the decoder's wide products use the lower precision.
+    Under autocast only the decoder's wide products use the lower precision, and the encoder's search for the largest.
+
+    A NaN or an infinity in a mesh makes all output vertices of its pair NaN, and of no other pair (see `shapes`).
 
     Examples
     --------
@@ -175,8 +177,10 @@ class Decoder(nn.Module):
             (self.block2, self.linear3, self.block3.norm1),
         ):
             first, second = block(active, vertices, probe)
-            hidden = _joined(first, second, block.linear2.weight, following.weight)
-            active = modulated_relu(hidden, vertices, *norm(probe))
+            # Without a name, so that it is gone before the next block.
+            active = modulated_relu(
+                _joined(first, second, block.linear2.weight, following.weight), vertices, *norm(probe)
+            )
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
             first, second = self.block3(active, vertices, probe)
             return 2 * torch.tanh(self._lowered(first, second))
@@ -188,6 +192,8 @@ class Decoder(nn.Module):
         line = normalised_linear(self.lift.weight, centred)
         monomials = (centred.unsqueeze(3) * vertices.unsqueeze(2)).flatten(2)
         coefficients = (line.unsqueeze(2) * scale.unsqueeze(1)).flatten(1, 2)
+        if torch.compiler.is_compiling():  # Inductor lays vertices into the concatenation, with one mesh's strides
+            return torch.relu(torch.baddbmm(vertices @ shift, monomials, coefficients))
         return torch.relu(torch.cat([monomials, vertices], dim=2) @ torch.cat([coefficients, shift], dim=1))
 
     def _lowered(self, first: Tensor, second: Tensor) -> Tensor:
