@@ -1,10 +1,12 @@
-"""How a network is run does not change what it computes, beyond the rounding that was asked for."""
+"""How a network is run does not change what it computes, beyond the rounding that was asked for.
+
+On a machine with torch and pytest alone: ``pytest --noconftest -m gpu tests/training/test_acceleration.py``.
+"""
 
 import contextlib
 import gc
 import threading
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,12 +14,9 @@ import torch
 from one_rank import two_backward_passes
 from torch import Tensor, nn
 
-from training import acceleration, transfer
+from training import acceleration
 from training.acceleration import CompilerError, GraphedTransfer, compiled, precision
-from training.data import Batch
-from training.inference import predict
 from training.networks import build_network
-from training.transfer import PoseTransfer
 
 SMALL: dict[str, dict[str, object]] = {
     "dsffnet": {"encoder_widths": (16, 32, 64), "decoder_widths": (32, 64, 32)},
@@ -41,14 +40,6 @@ def pair() -> dict[str, torch.Tensor]:
 @torch.no_grad()
 def test_a_graphed_network_gives_what_the_network_gives(network: nn.Module) -> None:
     assert torch.equal(GraphedTransfer(network)(**pair()), network(**pair()))
-
-
-@torch.no_grad()
-def test_predicting_on_a_cpu_is_calling_the_network(network: nn.Module) -> None:
-    meshes = {name: mesh.repeat(5, 1, 1) for name, mesh in pair().items()}
-    expected = torch.cat([network(**{name: mesh[part] for name, mesh in meshes.items()})
-                          for part in (slice(0, 8), slice(8, 10))])  # fmt: skip
-    assert torch.equal(predict(network, Batch(**meshes, truth=meshes["target"])), expected)
 
 
 @torch.no_grad()
@@ -282,17 +273,6 @@ def test_a_pair_on_two_devices_is_refused() -> None:
         GraphedTransfer(Counted())(source=source, target=target)
 
 
-def test_a_transfer_runs_where_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    placed = []
-    network = SimpleNamespace(to=lambda device: placed.append(str(device)) or Counted())
-    monkeypatch.setattr(transfer, "load_trained", lambda run: (network, None, 0))
-    for there in (True, False):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
-        PoseTransfer.from_run(Path("run"))
-    PoseTransfer.from_run(Path("run"), device="cuda:1")
-    assert placed == ["cuda", "cpu", "cuda:1"]
-
-
 @pytest.mark.parametrize(
     ("device", "variable", "message"),
     [
@@ -416,17 +396,6 @@ def test_a_graph_recorded_or_replayed_under_autocast_computes_in_its_own_precisi
     outside = [graphed(**on_gpu(seed)) for seed in range(3, 5)]
     for found, known in zip(inside + outside, expected, strict=True):
         assert torch.allclose(found, known, atol=close)
-
-
-@pytest.mark.gpu
-@torch.no_grad()
-def test_predicting_a_single_pair_on_a_gpu_is_replayed_and_the_same(network: nn.Module) -> None:
-    network = network.cuda()
-    for seed in range(4):
-        meshes = on_gpu(seed)
-        found = predict(network, Batch(**meshes, truth=meshes["target"]))
-        assert torch.allclose(found, network(**meshes), atol=1e-5)
-    assert is_replayed(network)
 
 
 @pytest.mark.gpu
