@@ -254,7 +254,11 @@ def _schedule(
     schedule = recipe.schedule
     if schedule.name == "one_cycle":
         return torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, recipe.learning_rate, total_steps=steps + 1, pct_start=schedule.warm_up, cycle_momentum=False
+            optimiser,
+            recipe.learning_rate,
+            total_steps=steps + 1,
+            pct_start=schedule.warm_up or 0.1,
+            cycle_momentum=False,
         )
     return torch.optim.lr_scheduler.StepLR(
         optimiser, step_size=schedule.decay_epochs * steps_per_epoch, gamma=schedule.decay

@@ -38,6 +38,8 @@ class DSFFNet(nn.Module):
         False is the ablation "w/o FFAdaIN": the first FFAdaIN of every block keeps its identity branch only (SPAdaIN).
     target_side
         False is the ablation "w/o side target": every FFAdaIN keeps its mixed branch only.
+    initial_mixing
+        Initial alpha and beta of every FFAdaIN: 0 is the paper's.
 
     Notes
     -----
@@ -45,7 +47,7 @@ class DSFFNet(nn.Module):
     parameter                              initial value
     =====================================  ==============================================
     weight, bias of a layer with i inputs  uniform in +-1/sqrt(i) (PyTorch's Conv1d, used by the released code)
-    alpha, beta of FFAdaIN                 0: at first the target's side alone modulates
+    alpha, beta of FFAdaIN                 `initial_mixing`; at 0 the target's side alone modulates at first
     =====================================  ==============================================
 
     What is not computed, and why the result is the same: the covariance of a layer's inputs gives the variance of its
@@ -69,11 +71,15 @@ class DSFFNet(nn.Module):
         decoder_widths: tuple[int, int, int] = (256, 1024, 256),
         feature_fusion: bool = True,
         target_side: bool = True,
+        initial_mixing: float = 0.0,
     ) -> None:
         super().__init__()
         _check_options(encoder_widths, decoder_widths, feature_fusion, target_side)
         self.encoder = PoseEncoder(tuple(encoder_widths))
         self.decoder = Decoder(tuple(decoder_widths), encoder_widths[-1], feature_fusion, target_side)
+        for name, parameter in self.named_parameters():
+            if name.endswith((".alpha", ".beta")):
+                nn.init.constant_(parameter, initial_mixing)
 
     def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
         """Return the target ``[b, n_target, 3]`` in the pose of the source ``[b, n_source, 3]``.
