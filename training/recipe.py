@@ -19,6 +19,7 @@ from training.recipe_networks import (
 __all__ = [
     "DEFAULT_NETWORK",
     "NETWORK_NAMES",
+    "PATH_KEYS",
     "AugmentationRecipe",
     "CoreNet3dRecipe",
     "DsffnetRecipe",
@@ -67,6 +68,14 @@ class ScheduleRecipe(Frozen):
         None, ge=0, lt=1, description="fraction of the steps spent rising; default: one_cycle 0.1, others 0"
     )
     hold: float = Field(0.5, ge=0, le=1, description="linear: fraction of the steps before it falls (3D-CoreNet: 0.5)")
+
+    @model_validator(mode="after")
+    def _rises_before_it_falls(self) -> "ScheduleRecipe":
+        if self.name == "linear" and (self.warm_up or 0) > self.hold:
+            raise ValueError(
+                f"warm_up {self.warm_up} is more than hold {self.hold}: set hold to {self.warm_up} or more"
+            )
+        return self
 
 
 class AugmentationRecipe(Frozen):
@@ -163,6 +172,22 @@ class TrainingRecipe(Frozen):
             raise ValueError(f"fewest_ranks {self.fewest_ranks} is more than ranks {self.ranks}")
         return self
 
+    @model_validator(mode="after")
+    def _can_be_meant(self) -> "TrainingRecipe":
+        kept = self.augmentation.vertices
+        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and kept < 1:
+            raise ValueError(
+                f"network.variant 'origin' pairs source and target by index, but augmentation.vertices {kept} "
+                "leaves vertices out: set augmentation.vertices to 1, or network.variant to maxpool"
+            )
+        if self.early_stopping and self.steps and self.evaluate_every >= self.steps:
+            raise ValueError(
+                f"early_stopping {self.early_stopping} goes by evaluations, but with evaluate_every "
+                f"{self.evaluate_every} there is none before the last of {self.steps} steps: "
+                "set evaluate_every lower, or early_stopping to null"
+            )
+        return self
+
     def require_same_learning(self, other: "TrainingRecipe", *, where: str) -> None:
         """Refuse to go on from a run that learned by another recipe.
 
@@ -183,6 +208,9 @@ class TrainingRecipe(Frozen):
                 "Choose another --out, or add --fresh to start over"
             )
 
+
+PATH_KEYS = frozenset({"start_from", "cache_folder"})
+"""Keys of a training recipe that name files or folders."""
 
 _HOW_IT_RUNS = {
     "ranks", "fewest_ranks", "launcher", "device", "cache", "cache_folder", "compile", "budget", "accumulate",
