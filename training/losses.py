@@ -7,17 +7,18 @@ NaN included, and influence neither a value nor a gradient. Every mesh counts th
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import embedding_bag, mse_loss
-from torch.utils.weak import WeakTensorKeyDictionary
+from torch.nn.functional import mse_loss
+
+from training.incidence import edge_vectors, incidence_of, sum_at_vertices
 
 EDGE_WEIGHT = 0.0005
 """Weight of the edge-length loss (DSFFNet, section 4.1)."""
@@ -212,10 +213,10 @@ class _EdgeError(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, known: Tensor, pairs: Tensor, weights: Tensor | None, squared: bool) -> Tensor:
-        incidence = _incidence(pairs, len(rows))
-        differences = _edge_vectors(rows, incidence)
+        incidence = incidence_of(pairs, len(rows))
+        differences = edge_vectors(rows, incidence)
         lengths = _lengths(differences, squared)
-        reference = _lengths(_edge_vectors(known, incidence), squared)
+        reference = _lengths(edge_vectors(known, incidence), squared)
         inverse = torch.where(reference > SHORTEST_EDGE ** (2 if squared else 1), 1 / reference, 0)
         error = (lengths - reference) * inverse
         if ctx.needs_input_grad[0]:
@@ -230,53 +231,7 @@ class _EdgeError(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
         (pull,) = ctx.saved_tensors
-        return _sum_at_vertices(pull, ctx.incidence).mul_(gradient), None, None, None, None
-
-
-class _Incidence(NamedTuple):
-    """Which edges touch a vertex: those from ``starts[v]`` on, in the order of the list, until the next vertex's.
-
-    Sums over it have a fixed order. Adding with atomic operations has none, and on CUDA gives other bits each time.
-    """
-
-    ends: Tensor  # [e, 2] int64
-    end_signs: Tensor  # [e, 2] +1, -1
-    edges: Tensor  # [2 e] int64
-    signs: Tensor  # [2 e] +1 where the vertex is the edge's first end, else -1
-    starts: Tensor  # [vertex] int64
-
-
-_INCIDENCES: MutableMapping[Tensor, _Incidence] = WeakTensorKeyDictionary()
-
-
-def _incidence(pairs: Tensor, vertices: int) -> _Incidence:
-    found = _INCIDENCES.get(pairs)
-    if found is None or len(found.starts) != vertices:
-        found = _INCIDENCES[pairs] = _make_incidence(pairs.detach(), vertices)  # not `pairs`, which a value would keep
-    return found
-
-
-def _make_incidence(pairs: Tensor, vertices: int) -> _Incidence:
-    at, order = torch.sort(pairs.t().reshape(-1), stable=True)
-    return _Incidence(
-        ends=pairs,
-        end_signs=torch.tensor([1.0, -1.0], device=pairs.device).repeat(len(pairs), 1),
-        edges=order % len(pairs),
-        signs=torch.where(order < len(pairs), 1.0, -1.0),
-        starts=torch.searchsorted(at, torch.arange(vertices, device=pairs.device)),
-    )
-
-
-def _edge_vectors(rows: Tensor, incidence: _Incidence) -> Tensor:
-    """Return the edges' vectors ``[e, m, 3]``."""
-    signs = incidence.end_signs.to(rows.dtype)
-    return embedding_bag(incidence.ends, rows, mode="sum", per_sample_weights=signs).view(len(signs), -1, 3)
-
-
-def _sum_at_vertices(pull: Tensor, incidence: _Incidence) -> Tensor:
-    """Return at every vertex the sum of its edges' rows ``[e, k]``, minus those that end there: ``[vertex, k]``."""
-    signs = incidence.signs.to(pull.dtype)
-    return embedding_bag(incidence.edges, pull, incidence.starts, mode="sum", per_sample_weights=signs)
+        return sum_at_vertices(pull, ctx.incidence).mul_(gradient), None, None, None, None
 
 
 def _lengths(differences: Tensor, squared: bool) -> Tensor:

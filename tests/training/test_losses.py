@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from training import losses
+from training import incidence
 from training.losses import (
     PaperLoss,
     edge_length_loss,
@@ -133,24 +133,24 @@ def test_sums_in_a_fixed_order_equal_those_by_index() -> None:
     pairs, pull = _many_edges()
     expected = torch.zeros(52, 6).double()  # two vertices more than edges touch
     expected.index_add_(0, pairs[:, 0], pull).index_add_(0, pairs[:, 1], pull, alpha=-1)
-    found = losses._sum_at_vertices(pull, losses._make_incidence(pairs, 52))
+    found = incidence.sum_at_vertices(pull, incidence.make_incidence(pairs, 52))
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_what_is_kept_of_edges_goes_when_they_go() -> None:
     prediction, truth = _pair()
     gc.collect()
-    before = len(losses._INCIDENCES)
+    before = len(incidence.INCIDENCES)
     edges = EDGES.clone()
     first = edge_length_loss(prediction, truth, edges)
-    kept = losses._incidence(edges, 5)
+    kept = incidence.incidence_of(edges, 5)
     assert torch.equal(edge_length_loss(prediction, truth, edges), first)
-    assert losses._incidence(edges, 5) is kept and len(losses._INCIDENCES) == before + 1
+    assert incidence.incidence_of(edges, 5) is kept and len(incidence.INCIDENCES) == before + 1
     longer = (torch.cat([each, each[:, :2]], dim=1) for each in (prediction, truth))
     assert edge_length_loss(*longer, edges).item() == pytest.approx(first.item())  # more vertices: worked out anew
     del edges, kept
     gc.collect()
-    assert len(losses._INCIDENCES) == before
+    assert len(incidence.INCIDENCES) == before
 
 
 @pytest.mark.gpu
