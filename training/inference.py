@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from training.batches import Batch
 from training.checkpoint import require_checkpoint
-from training.data import Batch
 from training.networks import build_network
 from training.recipe import NetworkRecipe, TrainingRecipe
 

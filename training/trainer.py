@@ -8,7 +8,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +17,9 @@ from torch.nn.parallel import DistributedDataParallel
 from datagen.errors import DsffnetError
 from datagen.store import Dataset, open_dataset
 from training.acceleration import autocast, products
+from training.banks import open_bank
+from training.batches import read_batch
 from training.checkpoint import CheckpointError, load_checkpoint, read_checkpoint, save_checkpoint
-from training.data import TripleOrder, VertexBank, read_batch
 from training.inference import network_from, predict
 from training.journal import Journal
 from training.losses import pose_transfer_loss
@@ -36,6 +37,7 @@ from training.ranks import (
     process_group,
 )
 from training.recipe import TrainingRecipe
+from training.triples import TripleOrder
 
 
 def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
@@ -82,7 +84,7 @@ class _Trainer:
             raise TrainingError(f"batch {recipe.batch} cannot be shared equally by {ranks.count} ranks")
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
         self.device, self._stop, self.stopping = device, stop, False
-        self.bank = VertexBank(dataset, dataset.identities("training"), device=self.device)
+        self.bank = open_bank(dataset, dataset.identities("training"), device=self.device, cache="device")
         self.order = TripleOrder(
             dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed
         )
@@ -103,7 +105,7 @@ class _Trainer:
         meter = _Meter(self.recipe.batch)
         triples = self.order.batches(first_step=self.done, rank=self.ranks.rank, ranks=self.ranks.count)
         while self.done < self.last_step and not self.stopping:
-            values = self.step(next(triples), meter)
+            values = self.step(next(triples)[0], meter)
             self.done += 1
             last = self.done == self.last_step
             probing = self.done % self.recipe.evaluate_every == 0 or last
@@ -132,7 +134,7 @@ class _Trainer:
             with autocast(self.recipe.precision, self.device):
                 prediction = self.model(source=batch.source, target=batch.target)
             loss, terms = pose_transfer_loss(
-                prediction, batch.truth, self.bank.edges, edge_weight=self.recipe.edge_weight
+                prediction, batch.truth, cast(Tensor, batch.edges), edge_weight=self.recipe.edge_weight
             )
             loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))

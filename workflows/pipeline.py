@@ -18,7 +18,6 @@ from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
 from training.checkpoint import CheckpointError, load_checkpoint, require_checkpoint
-from training.data import TripleOrder
 from training.evaluation import NO_OPS, Row, evaluate, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
@@ -28,6 +27,7 @@ from training.recipe import EvaluationRecipe, TrainingRecipe
 from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
+from training.triples import TripleOrder
 from workflows.console import alone_in
 from workflows.progress import bar, following, sampling
 
