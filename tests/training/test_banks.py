@@ -78,12 +78,18 @@ def equal_steps(one: list[tuple[Share, list[Batch]]], other: list[tuple[Share, l
     )
 
 
-def test_every_cache_gives_the_same_bits_in_the_same_order(legs: Dataset, folder: Path) -> None:
+def test_every_cache_gives_the_same_bits_in_the_same_order(
+    legs: Dataset, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     expected = steps(training_bank(legs), legs, count=36, first=4)
     for cache in CACHES[1:]:
         bank = training_bank(legs, cache)
         assert bank.place == cache and equal_steps(steps(bank, legs, count=36, first=4), expected), cache
         bank.close()
+    monkeypatch.setattr(room, "_container_room", lambda: 1)
+    cold = training_bank(legs, "mapped")
+    assert equal_steps(steps(cold, legs, count=36, first=4), expected), "a file larger than memory is read ahead, too"
+    cold.close()
     streamed = small_stream(legs)
     assert equal_steps(steps(streamed, legs, count=36, first=4), expected), "64 meshes at a time"
     assert all(same(streamed.batch(share[0]), batches[0]) for share, batches in expected[:5]), "not prefetched"
