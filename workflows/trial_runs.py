@@ -5,9 +5,12 @@ checkpoint, so that nothing is done twice. What stops or fails a trial ends that
 """
 
 import contextlib
+import signal
+import sys
+import threading
 import traceback
 import uuid
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +25,7 @@ from training.showcase import draw_training_curve
 from workflows.console import WorkflowError, alone_in
 from workflows.pipeline import _write_run_head, about_dataset, check_run_accepts, is_trained, recorded
 from workflows.progress import sampling
+from workflows.stages import say
 from workflows.trials import Trial
 
 _MARK = ".sweep"
@@ -128,14 +132,18 @@ def ray_trials(
     task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_RETRIES)(train_trial)
     running = {task.remote(_on_device(trial, gpus), place, tags=tags(trial), threads=cpus): trial for trial in trials}
     try:
-        while running:
-            done, _ = ray.wait(list(running), timeout=1.0)
-            for reference in done:
-                yield _outcome(reference, running.pop(reference), place)
-            if not done:
-                yield None
+        with _heeding_sigterm() as told:
+            while running:
+                done, _ = ray.wait(list(running), timeout=1.0)
+                for reference in done:
+                    yield _outcome(reference, running.pop(reference), place)
+                if told.is_set():
+                    sys.exit(TrainingStopped.exit_status)
+                if not done:
+                    yield None
     finally:
         if running:
+            say(f"stopping: {len(running)} trials finish their step and write a checkpoint")
             tell_to_stop(list(running.values()), place.out)
             ray.wait(list(running), num_returns=len(running), timeout=_STOPPING)
 
@@ -172,6 +180,23 @@ def _require_shared_disk(place: Place) -> None:
     mark = place.out / _MARK
     if not mark.exists() or mark.read_text() != place.mark:
         raise WorkflowError(f"this trial does not see {place.out} as the driver does: --out must be on a shared disk")
+
+
+@contextlib.contextmanager
+def _heeding_sigterm() -> Iterator[threading.Event]:
+    """Note SIGTERM while the block runs. Starting Ray replaced this process's handler by one that aborts it, and one
+    that raises SystemExit loses its status in Ray's calls.
+    """
+    told = threading.Event()
+    try:
+        before = signal.signal(signal.SIGTERM, lambda *_: told.set())
+    except ValueError:  # not the main thread
+        yield told
+        return
+    try:
+        yield told
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _require_room(cpus: int, gpus: float) -> None:
