@@ -148,6 +148,7 @@ def _draw_panel(axes: Axes, curves: Sequence[RunCurve], over: str, levels: Mappi
         axes.annotate(
             name, (0, level / PMD_UNIT), xycoords=("axes fraction", "data"), xytext=(3, 2.5),
             textcoords="offset points", fontsize=6.5, color=QUIET, parse_math=False,
+            bbox={"facecolor": PAGE, "edgecolor": "none", "alpha": 0.75, "pad": 0.4},
         )  # fmt: skip
     _styled(axes)
 

@@ -116,11 +116,12 @@ def report(sweep: Sweep, results: Sequence[Result], *, name: str, levels: dict[s
     """The table as a Markdown document with its definitions, what each trial sets, and why some failed."""
     best = best_of(results)
     threads = f"{cpus} thread{'s' if cpus > 1 else ''}"
+    shared = {word.split("=", 1)[0]: word for word in sweep.words}.values()  # a key may be given twice; the last counts
     triples = min(sweep.recipe.training.evaluate_triples, sweep.recipe.data.triples.count)
     parts = [
         f"# Sweep {name}",
         f"{len(results)} trainings from recipe {sweep.recipe_name}"
-        + (f" with {' '.join(sweep.words)}" if sweep.words else "")
+        + (f" with {' '.join(shared)}" if shared else "")
         + ". Lower PMD is better.",
         markdown(table(results, levels)),
         f"Best: **{best.trial.name}** ({_words(best.trial)})." if best else "No trial has finished.",
