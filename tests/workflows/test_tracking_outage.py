@@ -21,7 +21,7 @@ import pytest
 
 from tests.support.ranks import free_port
 from training.journal import Journal, read_journal
-from training.record import EXPERIMENT, Server, begin_record, end_record, find_records
+from training.record import EXPERIMENT, Server, begin_record, end_record, find_records, update_record
 from training.tracking import Mirror, TrackingError, publish
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
@@ -139,11 +139,10 @@ def test_missing_at_the_start_killed_in_the_middle_missing_at_the_end(server: Tr
         wait_for(lambda: len(pauses) > 100, 60)  # nobody there yet
         server.start()
         wait_for(lambda: noted(run, server) > 0, 60)
-        for _ in range(2):
-            server.kill()
-            server.start()
-            reached = (run / "metrics.jsonl").stat().st_size
-            wait_for(lambda reached=reached: noted(run, server) >= reached, 60)  # type: ignore[misc]
+        server.kill()
+        server.start()
+        reached = (run / "metrics.jsonl").stat().st_size
+        wait_for(lambda: noted(run, server) >= reached, 60)
         server.kill()
         lines = len(pauses)
         wait_for(lambda: len(pauses) > lines + 50, 10)
@@ -153,9 +152,7 @@ def test_missing_at_the_start_killed_in_the_middle_missing_at_the_end(server: Tr
     outage = mirror.close()
     assert isinstance(outage, TrackingError) and "dsffnet sync" in str(outage)
     assert time.perf_counter() - began < 30, "the end of the work waits for no server that is gone"
-    print(
-        f"median pause {sorted(pauses)[len(pauses) // 2] * 1e3:.2f} ms of {len(pauses)} lines, longest {max(pauses):.2f} s"
-    )
+    assert sorted(pauses)[len(pauses) // 2] < 0.02, "a line was written every few milliseconds throughout"
     server.start()
     sync = [sys.executable, "-m", "workflows.cli", "sync", str(root), "--tracking-uri", server.uri]
     for _ in range(2):
@@ -171,37 +168,31 @@ class Killed(BaseException):
     """As SIGKILL: nothing catches it, nothing is noted."""
 
 
-@pytest.mark.parametrize(
-    "call", ["create_run", "log_batch", "log_inputs", "log_artifact", "set_terminated", "create_experiment"]
-)
 def test_killed_between_any_call_and_the_note_about_it(
-    server: TrackingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+    server: TrackingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And then the training is gone on with: the same run, every point once."""
     server.start()
     root = tmp_path / "workflow"
     run = begin(root)
-    with training(run) as pauses:
-        wait_for(lambda: len(pauses) > 150, 30)
-    about: dict[str, Any] = {"name": "x.zarr", "manifest_sha256": "0" * 64}
-    with monkeypatch.context() as patch:
-        from training.record import update_record
-
+    for call in ("create_run", "log_batch", "log_inputs", "log_artifact", "set_terminated"):
+        begin(root)
+        with training(run) as pauses:
+            wait_for(lambda pauses=pauses: len(pauses) > 150, 30)  # type: ignore[misc]
+        about = {"name": f"{call}.zarr", "manifest_sha256": "0" * 64}
         update_record(run, dataset=about, artifacts=["metrics.jsonl"])
         end_record(run, "KILLED")
-        real = getattr(mlflow.MlflowClient, call)
+        with monkeypatch.context() as patch:
+            real = getattr(mlflow.MlflowClient, call)
 
-        def then_killed(*arguments: Any, **keywords: Any) -> None:
-            real(*arguments, **keywords)
-            raise Killed
+            def then_killed(*arguments: Any, real: Any = real, **keywords: Any) -> None:
+                real(*arguments, **keywords)
+                raise Killed
 
-        patch.setattr(mlflow.MlflowClient, call, then_killed)
-        for _ in range(2):
+            patch.setattr(mlflow.MlflowClient, call, then_killed)
             with pytest.raises(Killed):
                 publish(root, Server(server.uri))
     begin(root)
-    with training(run) as pauses:
-        wait_for(lambda: len(pauses) > 50, 30)
     publish(root, Server(server.uri))
     client = mlflow.MlflowClient(server.uri)
     runs = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
