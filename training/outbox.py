@@ -31,12 +31,13 @@ def unsent_rows(folder: Path, offsets: dict[str, int], *, values: int) -> Iterat
     for path in sorted(folder.glob("*.jsonl")):
         offset = offsets.get(path.name, 0)
         rows: MetricRows = []
+        held = 0
         for behind, row in journal_from(path, offset if offset <= path.stat().st_size else 0):
             rows.append(row)
-            offset = behind
-            if sum(map(len, rows)) >= values:
+            held, offset = held + len(row), behind
+            if held >= values:
                 yield path.name, offset, rows
-                rows = []
+                rows, held = [], 0
         if rows:
             yield path.name, offset, rows
 

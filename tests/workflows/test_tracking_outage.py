@@ -24,8 +24,9 @@ from training.journal import Journal, read_journal
 from training.record import EXPERIMENT, Server, begin_record, end_record, find_records, update_record
 from training.tracking import Mirror, TrackingError, publish
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 ROOT = Path(__file__).parents[2]
+_PAUSE = 0.02  # seconds between journal lines
 
 
 class TrackingServer:
@@ -87,7 +88,7 @@ def begin(root: Path) -> Path:
 
 @contextmanager
 def training(run: Path) -> Iterator[list[float]]:
-    """A stand-in for a training: a journal line every few milliseconds in a thread; yields the pauses between them."""
+    """A stand-in for a training: journal lines from a thread, many a second; yields the pauses between them."""
     stop, pauses = threading.Event(), []
 
     def work() -> None:
@@ -95,7 +96,7 @@ def training(run: Path) -> Iterator[list[float]]:
         while not stop.is_set():
             began = time.perf_counter()
             journal.write(journal.next_step, {"loss/total": 1 / (1 + journal.next_step), "learning_rate": 0.1})
-            time.sleep(0.005)
+            time.sleep(_PAUSE)
             pauses.append(time.perf_counter() - began)
         journal.close()
 
@@ -152,7 +153,7 @@ def test_missing_at_the_start_killed_in_the_middle_missing_at_the_end(server: Tr
     outage = mirror.close()
     assert isinstance(outage, TrackingError) and "dsffnet sync" in str(outage)
     assert time.perf_counter() - began < 30, "the end of the work waits for no server that is gone"
-    assert sorted(pauses)[len(pauses) // 2] < 0.02, "a line was written every few milliseconds throughout"
+    assert sorted(pauses)[len(pauses) // 2] < 3 * _PAUSE, "a line was written at its usual pace throughout"
     server.start()
     sync = [sys.executable, "-m", "workflows.cli", "sync", str(root), "--tracking-uri", server.uri]
     for _ in range(2):
@@ -209,7 +210,7 @@ def test_a_server_that_says_nothing_does_not_hold_up_the_work(server: TrackingSe
         wait_for(lambda: noted(run, server) > 0, 60)
         before = len(pauses)
         server.pause(3)
-        assert len(pauses) - before > 3 / 0.005 / 4, "the work went on"
+        assert len(pauses) - before > 3 / _PAUSE / 4, "the work went on"
     end_record(run, "FINISHED")
     assert mirror.close() is None
     assert_same_as_journal(server, run)
