@@ -1,9 +1,14 @@
 """DSFFNet on one device, fast form against literal form: ``python -m benchmarks.gpu``.
 
-Forward and training step at 6,890 vertices, batch 8 and 64, in float32, TF32 and bfloat16, plain and compiled; peak
-memory; the share of the device's measured matrix rate; one pair by a CUDA graph. Needs torch alone, neither Ray nor
-Zarr, so that it runs on a bare GPU machine; with ``--device cpu --vertices 200 --batches 2 --narrow`` it can be tried
-anywhere.
+First whether the device computes what a CPU does and what rounding costs; then one pair at a time, called and by CUDA
+graph; then forward and training step of whole batches, in float32, TF32 and bfloat16: literal, fast, and fast through
+torch.compile. Beside each time: the ratio to the literal float32 form, the memory at the peak less what was held before
+(weights, inputs, the optimiser's state), the share of the measured matrix rate, and how far the result is off the
+literal float32 form's: the largest difference of any output coordinate, the relative one of the whole gradient. What
+fails is said in its place and the rest goes on; the exit status is then 1.
+
+Needs torch and NumPy alone, so that it runs on a bare GPU machine. ``--device cpu --vertices 200 --batches 2 --narrow``
+tries it anywhere.
 """
 
 from __future__ import annotations
@@ -11,81 +16,207 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from training.acceleration import GraphedTransfer, Precision, autocast, precision, products
-from training.losses import pose_transfer_loss
+from benchmarks.running import (
+    Meshes,
+    forward,
+    gradient,
+    largest,
+    mean_square,
+    random_meshes,
+    relative,
+    step,
+    with_every_branch,
+)
+from benchmarks.timing import copy_rate, matrix_rate, measured, release, timed
+from training.acceleration import GraphedTransfer, Precision, compiled
 from training.networks.dsffnet import DSFFNet
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "training"))
+# isort: split
 from literal_dsffnet import LiteralDSFFNet
 
 PRECISIONS: tuple[Precision, ...] = ("float32", "tf32", "bfloat16")
+NARROW = {"encoder_widths": (16, 32, 256), "decoder_widths": (64, 256, 64)}
+failures: list[str] = []
 
 
-def main() -> None:
-    """Measure and print everything."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--vertices", type=int, default=6890)
-    parser.add_argument("--batches", type=int, nargs="+", default=[8, 64])
-    parser.add_argument("--narrow", action="store_true", help="a quarter of the paper's widths")
-    parser.add_argument("--compile", action="store_true", help="also the fast form through torch.compile")
-    options = parser.parse_args()
+class Reference(NamedTuple):
+    """The literal form in float32: what the other forms are compared with."""
+
+    result: Any
+    seconds: float
+
+
+def main() -> int:
+    """Measure and print everything; the exit status is 1 if anything failed."""
+    failures.clear()
+    options = arguments()
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         sys.exit(
             "error: torch sees no CUDA device here. Try it on a CPU: --device cpu --vertices 200 --batches 2 --narrow"
         )
+    options.forms = ("literal", "fast", "compiled") if options.compile else ("literal", "fast")
+    options.deadline = time.monotonic() + 60 * options.minutes
+    rates = {how: matrix_rate(how, device) for how in options.precisions}
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    rates = {how: matrix_rate(how, device) for how in PRECISIONS}
-    print(
-        f"torch {torch.__version__}, {name}; measured matrix rates, TFLOP/s: "
-        + ", ".join(f"{how} {rate:.1f}" for how, rate in rates.items())
-    )
+    print(f"torch {torch.__version__}, Python {sys.version.split()[0]}, {name}")
+    print(f"matrix rates, TFLOP/s: {', '.join(f'{how} {rate:.2f}' for how, rate in rates.items())}", end="; ")
+    print(f"copying {copy_rate(device):,.0f} GB/s read and written", flush=True)
+    parity(options, device)
+    single_pairs(options, device)
     for batch in options.batches:
         table(batch, options, device, rates)
-    single_pair(options, device)
+    return 1 if failures else 0
 
 
-def networks(options: argparse.Namespace, device: torch.device) -> dict[str, nn.Module]:
-    """Every form with the same weights."""
+def arguments() -> argparse.Namespace:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--vertices", type=int, default=6890)
+    parser.add_argument("--batches", type=int, nargs="*", default=[8, 64])
+    parser.add_argument("--precisions", nargs="+", choices=PRECISIONS, default=PRECISIONS)
+    parser.add_argument("--narrow", action="store_true", help="a quarter of the paper's widths")
+    parser.add_argument(
+        "--compile", action=argparse.BooleanOptionalAction, default=True, help="also the fast form by torch.compile"
+    )
+    parser.add_argument("--minutes", type=float, default=60.0, help="begin nothing more after so many minutes")
+    return parser.parse_args()
+
+
+def form_of(name: str, options: argparse.Namespace, device: torch.device) -> nn.Module:
+    """One form of the network; the weights are always the same."""
     torch.manual_seed(0)
-    widths = {"encoder_widths": (16, 32, 256), "decoder_widths": (64, 256, 64)} if options.narrow else {}
-    fast = DSFFNet(**widths).to(device)
-    found: dict[str, nn.Module] = {"literal": LiteralDSFFNet(fast).to(device), "fast": fast}
-    if options.compile:
-        found["compiled"] = torch.compile(fast, dynamic=False)  # type: ignore[assignment]
-    return found
+    fast = with_every_branch(DSFFNet(**(NARROW if options.narrow else {})))
+    network = LiteralDSFFNet(fast) if name == "literal" else fast
+    network.to(device)
+    return compiled(network, device) if name == "compiled" else network
+
+
+def parity(options: argparse.Namespace, device: torch.device) -> None:
+    """How far outputs and gradients are apart on two meshes, without torch.compile."""
+    print(f"\nparity, batch 2 x {options.vertices:,} vertices: largest difference, PMD, gradient")
+    pairs: list[tuple[str, str, Precision, torch.device]] = [("fast", "fast", "float32", torch.device("cpu"))]
+    pairs += [("fast", "literal", "float32", device), ("literal", "literal", "float32", torch.device("cpu"))]
+    for form, other, how, where in pairs:
+        attempt(f"  {form} on {device.type} and {other} on {where.type}", compare, options, (form, how, device),
+                (other, how, where))  # fmt: skip
+    for how in [name for name in options.precisions if name != "float32"]:
+        for form in ("fast", "literal"):
+            attempt(f"  {form} in {how} and in float32", compare, options, (form, how, device),
+                    (form, "float32", device))  # fmt: skip
+
+
+def compare(options: argparse.Namespace, *sides: tuple[str, Precision, torch.device]) -> str:
+    """The differences of two forms, each (name, precision, device)."""
+    outputs, gradients = [], []
+    for name, how, device in sides:
+        network, meshes = form_of(name, options, device), random_meshes(2, options.vertices, device)
+        outputs.append(forward(network, how, meshes).cpu())
+        gradients.append(gradient(network, how, meshes))
+    return f"{largest(*outputs):.1e}   {mean_square(*outputs):.1e}   {relative(*gradients):.1e}"
+
+
+def single_pairs(options: argparse.Namespace, device: torch.device) -> None:
+    """One pair at a time: every form in every precision, called and replayed."""
+    print(f"\none pair of {options.vertices:,} vertices, milliseconds: least, median (off fast float32 by)", flush=True)
+    meshes = random_meshes(1, options.vertices, device)
+    exact = forward(form_of("fast", options, device), "float32", meshes)
+    for how in options.precisions:
+        for form in options.forms:
+            attempt(f"  {form:9}{how:9}", late(single_pair, options), form, how, meshes, exact, options)
+            release(device)
+
+
+def single_pair(form: str, how: Precision, meshes: Meshes, exact: Tensor, options: argparse.Namespace) -> str:
+    """One form in one precision."""
+    device = meshes.source.device
+    network = form_of(form, options, device).eval()
+    cells = []
+    for way, kept in (("called", 0), ("replayed", 8))[: 2 if device.type == "cuda" else 1]:
+        transfer = GraphedTransfer(network, precision=how, kept=kept)  # which without room for graphs only calls
+        call = partial(transfer, source=meshes.source, target=meshes.target)
+        off = max(largest(call(), exact) for _ in range(3))
+        taken = sorted(timed(call, device) for _ in range(50 if device.type == "cuda" else 2))
+        cells.append(f"{way} {1e3 * taken[0]:8.3f} {1e3 * taken[len(taken) // 2]:8.3f} ({off:.1e})")
+    return "   ".join(cells)
 
 
 def table(batch: int, options: argparse.Namespace, device: torch.device, rates: dict[Precision, float]) -> None:
-    """One batch size: every form in every precision."""
+    """One batch size: every form in every precision, forward and step."""
     print(f"\nbatch {batch} x {options.vertices:,} vertices")
-    print("  milliseconds (times faster than the literal float32 form), GiB at the peak, share of the ceiling")
-    literal: dict[str, float] = {}
-    forms = networks(options, device)
-    work = 2.0 * options.vertices * batch * multiplications(forms["fast"])
-    for form, network in forms.items():
-        torch._dynamo.reset()
-        for how in PRECISIONS:
-            cells = []
-            for what, times in (("forward", 1), ("step", 3)):
-                try:
-                    seconds, gibibytes = measure(what, network, how, batch, options.vertices, device)
-                except torch.OutOfMemoryError:
-                    cells.append(f"{what}: out of memory")
-                    continue
-                if form == "literal":
-                    literal[what] = seconds
-                ratio = literal[what] / seconds if what in literal else float("nan")
-                share = times * work / seconds / (rates[how] * 1e12)
-                cells.append(f"{what} {1e3 * seconds:9.2f} ({ratio:5.2f}x) {gibibytes:6.2f} {share:6.1%}")
-            print(f"  {form:9}{how:9} {'   '.join(cells)}", flush=True)
+    print("  milliseconds (times faster than literal float32), GiB, share of the matrix rate, off by", flush=True)
+    meshes = random_meshes(batch, options.vertices, device)
+    work = 2.0 * options.vertices * batch * multiplications(form_of("fast", options, torch.device("cpu")))
+    references: dict[str, Reference] = {}
+    for form in options.forms:
+        for how in options.precisions:
+            least = {"forward": work / (rates[how] * 1e12), "step": 3 * work / (rates[how] * 1e12)}
+            for what, seconds in least.items():
+                label = f"  {what:8}{form:9}{how:9}"
+                attempt(label, late(cell, options), what, form, how, meshes, options, seconds, references)
+                release(device)
+
+
+def cell(
+    what: str,
+    form: str,
+    how: Precision,
+    meshes: Meshes,
+    options: argparse.Namespace,
+    least: float,
+    references: dict[str, Reference],
+) -> str:
+    """Forward or step of one form in one precision; `least` is the seconds that its products take at best."""
+    device = meshes.source.device
+    network = form_of(form, options, device)
+    result, off = results(what, network, how, meshes), float("nan")
+    seconds, gibibytes = measured(work_of(what, network, how, meshes), device)
+    if (form, how) == ("literal", "float32"):
+        references[what] = Reference(result, seconds)
+    ratio = float("nan")
+    if what in references:
+        exact = references[what]
+        ratio = exact.seconds / seconds
+        off = largest(result, exact.result) if what == "forward" else relative(result, exact.result)
+    return f"{1e3 * seconds:9.2f} ({ratio:5.2f}x) {gibibytes:7.2f} {least / seconds:6.1%}   {off:.1e}"
+
+
+def results(what: str, network: nn.Module, how: Precision, meshes: Meshes) -> Any:
+    """The output, or the gradients."""
+    return forward(network, how, meshes).cpu() if what == "forward" else gradient(network, how, meshes)
+
+
+def work_of(what: str, network: nn.Module, how: Precision, meshes: Meshes) -> Callable[[], object]:
+    """What is timed."""
+    if what == "forward":
+        return partial(forward, network, how, meshes)
+    return partial(step, network, how, torch.optim.AdamW(network.parameters(), lr=1e-6), meshes)
+
+
+def late(work: Callable[..., str], options: argparse.Namespace) -> Callable[..., str]:
+    """`work`, unless the time is up."""
+    return work if time.monotonic() < options.deadline else lambda *_: "left out: the minutes are up"
+
+
+def attempt(label: str, work: Callable[..., str], *arguments: object) -> None:
+    """Print a line; what fails must not cost the lines after it."""
+    try:
+        print(f"{label} {work(*arguments)}", flush=True)
+    except torch.OutOfMemoryError:
+        print(f"{label} out of memory", flush=True)
+    except Exception as error:
+        failures.append(label)
+        print(f"{label} failed: {type(error).__name__}: {str(error).splitlines()[0]}", flush=True)
+        traceback.print_exc()
 
 
 def multiplications(network: nn.Module) -> int:
@@ -98,91 +229,5 @@ def multiplications(network: nn.Module) -> int:
     return sum(value.shape[0] * value.shape[1] for value in wide)
 
 
-def measure(
-    what: str, network: nn.Module, how: Precision, batch: int, vertices: int, device: torch.device
-) -> tuple[float, float]:
-    """Seconds of one call (the least of several) and the peak memory in GiB."""
-    source, target, truth = (torch.rand(batch, vertices, 3, device=device) * 2 - 1 for _ in range(3))
-    edges = torch.randint(vertices, (3 * vertices, 2), device=device)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=1e-6)
-
-    def forward() -> None:
-        with torch.no_grad(), precision(how, device):
-            network(source=source, target=target)
-
-    def step() -> None:
-        optimiser.zero_grad(set_to_none=True)
-        with products(how):
-            with autocast(how, device):
-                prediction = network(source=source, target=target)
-            pose_transfer_loss(prediction, truth, edges)[0].backward()
-        optimiser.step()
-
-    work = forward if what == "forward" else step
-    for _ in range(3):
-        work()
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    seconds = min(timed(work, device) for _ in range(10 if device.type == "cuda" else 2))
-    peak = torch.cuda.max_memory_allocated(device) / 2**30 if device.type == "cuda" else float("nan")
-    return seconds, peak
-
-
-def timed(work: Callable[[], None], device: torch.device) -> float:
-    """Seconds of one call, the device's work included."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    start = time.perf_counter()
-    work()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter() - start
-
-
-def matrix_rate(how: Precision, device: torch.device) -> float:
-    """TFLOP/s of a large product in a precision: the ceiling."""
-    size = 8192 if device.type == "cuda" else 1024
-    left, right = (torch.rand(size, size, device=device) for _ in range(2))
-
-    def work() -> None:
-        with precision(how, device):
-            left @ right
-
-    work()
-    return 2 * size**3 / min(timed(work, device) for _ in range(5)) / 1e12
-
-
-@torch.no_grad()
-def single_pair(options: argparse.Namespace, device: torch.device) -> None:
-    """One pair at a time: the network called, and replayed."""
-    fast = networks(options, device)["fast"].eval()
-    source, target = (torch.rand(1, options.vertices, 3, device=device) * 2 - 1 for _ in range(2))
-    print(f"\none pair of {options.vertices:,} vertices, milliseconds")
-    for how in PRECISIONS:
-        for form, call in calls(fast, how, source, target, device):
-            for _ in range(3):
-                call()
-            print(f"  {form:9}{how:9} {1e3 * min(timed(call, device) for _ in range(20)):8.3f}", flush=True)
-
-
-def calls(
-    network: nn.Module, how: Precision, source: Tensor, target: Tensor, device: torch.device
-) -> Iterator[tuple[str, Callable[[], None]]]:
-    """The network as it is, and by a CUDA graph."""
-
-    def called() -> None:
-        with precision(how, device):
-            network(source=source, target=target)
-
-    yield "called", called
-    if device.type == "cuda":
-        graphed = GraphedTransfer(network, precision=how)
-
-        def replayed() -> None:
-            graphed(source=source, target=target)
-
-        yield "replayed", replayed
-
-
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,32 +1,36 @@
 """The networks, fast form against literal form, on a CPU: ``python -m benchmarks.networks [--threads 2] [--quick]``.
 
 Every form has the same weights and inputs and all run in turns, so that a slow moment of the machine hits all; times
-are medians. A step is forward, both losses, backward and AdamW. Memory is the peak of a process of its own over what it
-held before the step.
+are medians. A step is forward, both losses, backward and AdamW. "Off by" is measured before any step: the largest
+difference of any output coordinate from the literal form's, and the length of the difference of the whole gradient over
+the length of the literal form's (where both name their parameters alike). Memory is the peak of a process of its own
+over what it held before the step.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from benchmarks.peak_memory import forget_peak, peak_mebibytes
-from training.acceleration import Precision, autocast, precision, products
+from benchmarks.running import Meshes, forward, gradient, largest, random_meshes, relative, step, with_every_branch
+from training.acceleration import Precision
 from training.losses import pose_transfer_loss
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "training"))
+# isort: split
 from literal_corenet3d import LiteralCoreNet3D
 from literal_dsffnet import LiteralDSFFNet
 from literal_npt import LiteralNPT
@@ -57,11 +61,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="small shapes only")
-    parser.add_argument("--memory", metavar="FORM", help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--memory", metavar="FORM", choices=FORMS, help="only the peak memory of a step of this form, in MiB"
+    )
+    parser.add_argument("--vertices", type=int, default=6890, help="of --memory (6890)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if options.memory:
-        print(peak_of_a_step(options.memory))
+        print(peak_of_a_step(options.memory, options.vertices))
         return
     print(f"torch {torch.__version__}, CPU, {options.threads} threads, milliseconds (times faster than literal)")
     for name in list(CASES)[:1] if options.quick else CASES:
@@ -72,86 +79,81 @@ def main() -> None:
 
 def show(name: str, case: Case) -> None:
     """One network's table."""
-    print(f"\n{name}, {case.batch} x {case.vertices:,} vertices")
-    for what, times in measure(case).items():
-        middle = {form: 1e3 * statistics.median(taken) for form, taken in times.items()}
-        literal = middle.get("literal")
-        cells = [
-            f"{form} {value:,.1f}" + (f" ({literal / value:.1f}x)" if literal else "") for form, value in middle.items()
-        ]
-        print(f"  {what:9}{'   '.join(cells)}")
-
-
-def measure(case: Case) -> dict[str, dict[str, list[float]]]:
-    """Seconds of every repetition, by what is done and by which form."""
+    print(f"\n{name}, {case.batch} x {case.vertices:,} vertices", flush=True)
     torch.manual_seed(0)
-    fast = case.make()
+    fast = with_every_branch(case.make())
     forms = {"literal": case.literal(fast), "fast": fast, "fast bf16": fast}
-    source, target, truth, edges = inputs(case.batch, case.vertices)
+    meshes = random_meshes(case.batch, case.vertices, CPU)
+    differences = compare(forms, meshes)
+    times = measure(forms, meshes, case.repeats)
+    for what, unit in (("forward", ""), ("step", " of the gradient")):
+        print(f"  {what:9}{'   '.join(cells(times[what], differences[what], unit))}")
+    losses = times["losses"]["both"]
+    shares = [f"{losses / times['step'][form]:.1%} of the step of {form}" for form in forms]
+    print(f"  losses   {1e3 * losses:,.1f}: {', '.join(shares)}")
+
+
+def cells(times: dict[str, float], differences: dict[str, float], unit: str) -> list[str]:
+    """Time, ratio and difference of every form."""
+    literal = times["literal"]
+    known = {form: f", off by {off:.1e}{unit}" for form, off in differences.items() if not math.isnan(off)}
+    ratios = {form: f" ({literal / times[form]:.1f}x{known.get(form, '')})" for form in differences}
+    return [f"{form} {1e3 * taken:,.1f}{ratios.get(form, '')}" for form, taken in times.items()]
+
+
+def compare(forms: dict[str, nn.Module], meshes: Meshes) -> dict[str, dict[str, float]]:
+    """The largest difference of any output coordinate from the literal form's, and the gradient's relative one."""
+    outputs, gradients = {}, {}
+    for form, network in forms.items():
+        network.eval()  # 3D-CoreNet's spectral norms advance at every call in training mode
+        outputs[form] = forward(network, FORMS[form], meshes)
+        gradients[form] = gradient(network, FORMS[form], meshes)
+        network.train()
+    others = [form for form in forms if form != "literal"]
+    return {
+        "forward": {form: largest(outputs[form], outputs["literal"]) for form in others},
+        "step": {form: relative(gradients[form], gradients["literal"]) for form in others},
+    }
+
+
+def measure(forms: dict[str, nn.Module], meshes: Meshes, repeats: int) -> dict[str, dict[str, float]]:
+    """Seconds (medians), by what is done and by which form."""
     optimisers = {form: torch.optim.AdamW(network.parameters(), lr=1e-6) for form, network in forms.items()}
-    times: dict[str, dict[str, list[float]]] = {"forward": {}, "step": {}, "losses": {"fast": []}}
-    for repeat in range(case.repeats + 1):
+    times: dict[str, dict[str, list[float]]] = {"forward": {}, "step": {}, "losses": {}}
+    moved = (meshes.truth * 0.9).requires_grad_()
+    for repeat in range(repeats + 1):
         for form, network in forms.items():
-            for what, work in (
-                ("forward", lambda n=network, f=form: forward(n, FORMS[f], source, target)),
-                ("step", lambda n=network, f=form: step(n, FORMS[f], optimisers[f], source, target, truth, edges)),
-            ):
-                keep(times[what].setdefault(form, []), work, repeat)
-        moved = truth.clone().requires_grad_()
-        keep(times["losses"]["fast"], lambda m=moved: pose_transfer_loss(m, truth * 0.9, edges)[0].backward(), repeat)
-    return times
+            how = FORMS[form]
+            keep(times["forward"], form, repeat, partial(forward, network, how, meshes))
+            keep(times["step"], form, repeat, partial(step, network, how, optimisers[form], meshes))
+        keep(times["losses"], "both", repeat, partial(both_losses, moved, meshes))
+    return {what: {form: statistics.median(taken) for form, taken in found.items()} for what, found in times.items()}
 
 
-def keep(taken: list[float], work: Callable[[], object], repeat: int) -> None:
+def both_losses(moved: Tensor, meshes: Meshes) -> None:
+    """Both losses of a prediction, and their gradients."""
+    pose_transfer_loss(moved, meshes.truth, meshes.edges)[0].backward()
+
+
+def keep(times: dict[str, list[float]], form: str, repeat: int, work: Callable[[], object]) -> None:
     """Time one call; the first is for warming up."""
     start = time.perf_counter()
     work()
     if repeat:
-        taken.append(time.perf_counter() - start)
+        times.setdefault(form, []).append(time.perf_counter() - start)
 
 
-def inputs(batch: int, vertices: int, device: torch.device = CPU) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Source, target, truth [batch, vertex, 3] and edges [3 vertex, 2]."""
-    meshes = (torch.rand(batch, vertices, 3, device=device) * 2 - 1 for _ in range(3))
-    return (*meshes, torch.randint(vertices, (3 * vertices, 2), device=device))  # type: ignore[return-value]
-
-
-@torch.no_grad()
-def forward(network: nn.Module, how: Precision, source: Tensor, target: Tensor) -> Tensor:
-    """One inference."""
-    with precision(how, source.device):
-        return network(source=source, target=target)  # type: ignore[no-any-return]
-
-
-def step(
-    network: nn.Module,
-    how: Precision,
-    optimiser: torch.optim.Optimizer,
-    source: Tensor,
-    target: Tensor,
-    truth: Tensor,
-    edges: Tensor,
-) -> None:
-    """One training step."""
-    optimiser.zero_grad(set_to_none=True)
-    with products(how):
-        with autocast(how, source.device):
-            prediction = network(source=source, target=target)
-        pose_transfer_loss(prediction, truth, edges)[0].backward()
-    optimiser.step()
-
-
-def peak_of_a_step(form: str) -> float:
-    """MiB that a step of batch 8 at 6,890 vertices takes over what was held before."""
+def peak_of_a_step(form: str, vertices: int) -> float:
+    """MiB that a step of batch 8 takes over what was held before."""
     network: nn.Module = DSFFNet()
     if form == "literal":
         network = LiteralDSFFNet(network)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-6)
-    step(network, FORMS[form], optimiser, *inputs(1, 50))
-    meshes = inputs(8, 6890)
+    step(network, FORMS[form], optimiser, random_meshes(1, 50, CPU))
+    meshes = random_meshes(8, vertices, CPU)
     forget_peak()
     before = peak_mebibytes()
-    step(network, FORMS[form], optimiser, *meshes)
+    step(network, FORMS[form], optimiser, meshes)
     return peak_mebibytes() - before
 
 

@@ -13,6 +13,7 @@ class Stream(IntEnum):
     EVALUATION_TRIPLES = 3
     TRAINING_TRIPLES = 4
     WEIGHTS = 5
+    AUGMENTATION = 6
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

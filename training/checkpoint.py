@@ -1,166 +1,240 @@
-"""Checkpoints: atomic, hashed, the newest few kept. Rank 0 alone writes; every rank reads.
+"""Checkpoints: atomic, hashed, the newest few and the best kept. Rank 0 alone writes; every rank reads.
 
-RUN/checkpoints/step-N/ holds weights.safetensors, state.pt (optimiser and schedule) and manifest.json: step, recipe,
-dataset, and the sha256 of the two files. A checkpoint is written to a temporary folder and renamed; RUN/latest is
-moved last. Weights without state.pt (an exported model) load just as well, only they cannot be trained on.
+RUN/checkpoints/step-N/ holds weights.safetensors, average.safetensors where a moving average of the weights is kept,
+state.pt (optimiser, schedule, counters, random states) and manifest.json: step, recipe, dataset, versions, whether it
+was the best so far, and the sha256 of the other files. A checkpoint is written to a temporary folder, synced to the
+disk and renamed, which is the one moment that counts; then RUN/best and, last, RUN/latest are moved.
+Weights without state.pt (an exported model) load just as well, only they cannot be trained on.
 """
 
-import hashlib
-import json
 import logging
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from datagen.errors import DsffnetError, StorageError
 from datagen.mesh import write_atomically
+from training.checkpoint_folder import (
+    AVERAGE,
+    BEST,
+    LATEST,
+    MANIFEST,
+    STATE,
+    WEIGHTS,
+    Writer,
+    best_of,
+    commit,
+    commit_into,
+    fault_of,
+    forget_old,
+    is_listed,
+    manifest_of,
+    newest_first,
+    weights_writer,
+    write_manifest,
+)
+from training.weights import CheckpointError, cast_weights, read_header, read_weights
+
+__all__ = [
+    "Checkpoint",
+    "CheckpointError",
+    "export_weights",
+    "load_checkpoint",
+    "read_checkpoint",
+    "require_checkpoint",
+    "save_checkpoint",
+]
 
 log = logging.getLogger(__name__)
-
-_WEIGHTS, _STATE, _MANIFEST = "weights.safetensors", "state.pt", "manifest.json"
-
-
-class CheckpointError(DsffnetError):
-    """A run without a usable checkpoint, or one that does not belong to what is asked."""
+Which = Literal["latest", "best"] | int
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One sound checkpoint: its folder, the step, and the recipe and the dataset's uuid that it was trained with."""
+    """One sound checkpoint: its folder (or file of weights), the step, and what it was trained by, on and with.
+
+    ``dataset`` is the dataset's uuid, ``dataset_sha256`` the sha256 of its manifest ("" where it was not noted).
+    ``finished``: training had come to its end there, by its steps or by early stopping.
+    """
 
     path: Path
     step: int
     recipe: dict[str, Any]
     dataset: str
+    dataset_sha256: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    best: bool = False
+    finished: bool = False
 
-    def weights(self) -> dict[str, Tensor]:
-        """Weights by parameter name, on the CPU."""
-        return load_file(self.path / _WEIGHTS)
+    def weights(self, *, average: bool = False) -> dict[str, Tensor]:
+        """Weights by parameter name, on the CPU; ``average``: their moving average, if this training keeps one."""
+        if self.path.is_file():
+            return read_weights(self.path)
+        has_average = average and (self.path / AVERAGE).exists()
+        return read_weights(self.path / (AVERAGE if has_average else WEIGHTS))
 
     def state(self) -> dict[str, Any]:
-        """State of the optimiser and the schedule."""
-        return dict(torch.load(self.path / _STATE, map_location="cpu", weights_only=True))
+        """State of the optimiser, the schedule and whatever else training goes on from.
+
+        Raises
+        ------
+        CheckpointError
+            These are weights only.
+        """
+        if not (self.path / STATE).is_file():
+            raise CheckpointError(f"{self.path} holds weights only, which training can start from but not go on from")
+        return dict(torch.load(self.path / STATE, map_location="cpu", weights_only=True))
 
 
 def save_checkpoint(
-    run: Path, *, about: dict[str, Any], weights: dict[str, Tensor], state: dict[str, Any], keep: int
+    run: Path,
+    *,
+    about: Mapping[str, Any],
+    weights: Mapping[str, Tensor],
+    state: Mapping[str, Any],
+    keep: int,
+    best: bool = False,
+    average: Mapping[str, Tensor] | None = None,
 ) -> Path:
-    """Write RUN/checkpoints/step-N and forget all but the newest ``keep``.
+    """Write RUN/checkpoints/step-N and forget all but the newest ``keep`` and the best.
 
-    ``about`` holds step, recipe and dataset, see :class:`Checkpoint`.
+    Parameters
+    ----------
+    about
+        step, recipe and dataset (uuid), and dataset_sha256 where it is known; see :class:`Checkpoint`.
+    weights, average
+        Tensors by parameter name, and their moving average.
+    state
+        What ``torch.load(weights_only=True)`` reads: tensors, numbers, text, dictionaries, lists.
+    best
+        No earlier checkpoint of this run was as good.
 
     Raises
     ------
     StorageError
         It could not be written; earlier checkpoints are untouched.
     """
-    folder = run / "checkpoints"
-    final = folder / f"step-{about['step']:08d}"
-    if final.exists() and _fault(final) is None:
-        return final  # training is deterministic: this step's checkpoint is there
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(dir=folder, prefix=".partial-"))
-        try:
-            _write(temporary, about, weights, state)
-            shutil.rmtree(final, ignore_errors=True)  # a damaged one
-            os.replace(temporary, final)
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
-    except (OSError, SafetensorError, RuntimeError) as error:  # a full disk: safetensors and torch say it their own way
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise StorageError(f"could not write checkpoint {final}: {reason}. Earlier checkpoints are kept") from error
-    write_atomically(run / "latest", f"{final.name}\n".encode())
-    _forget_old(folder, keep)
+    final = run / "checkpoints" / f"step-{about['step']:08d}"
+    if fault_of(final) is not None:
+        writers: dict[str, Writer] = {
+            WEIGHTS: weights_writer(weights, about),
+            STATE: lambda path: torch.save(dict(state), path),
+        }
+        if average is not None:
+            writers[AVERAGE] = weights_writer(average, {**about, "average": True})
+        commit(final, {**about, "versions": _versions(), "best": best}, writers)
+    elif best:  # training is deterministic: this step's checkpoint is there, only perhaps not yet known as the best
+        write_manifest(final, manifest_of(final) | {"best": True})
+    if best:
+        write_atomically(run / BEST, f"{final.name}\n".encode())
+    write_atomically(run / LATEST, f"{final.name}\n".encode())
+    forget_old(run, keep)
     return final
 
 
-def load_checkpoint(run: Path) -> Checkpoint | None:
-    """The newest sound checkpoint of a run (or the one that ``run`` itself is), None where there is none.
+def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
+    """A checkpoint of a run: the newest sound one, the best, or that of a step; None where there is none.
 
-    A damaged one is passed over with a warning that names it, and the one before it is taken.
+    A damaged newest one is passed over with a warning that names it, and the one before it is taken. Where ``run`` is
+    itself a checkpoint (a step's folder, exported weights, a .safetensors file), that one and no other is meant.
+
+    Raises
+    ------
+    CheckpointError
+        The one that was asked for, by its path, its step or as the best, is damaged; or there is no such step.
     """
-    here = [run] if (run / _MANIFEST).exists() else []
-    for path in (*here, *_newest_first(run / "checkpoints")):
-        fault = _fault(path)
+    if _is_checkpoint(run):
+        return _named(run)
+    if which == "latest":
+        return _newest_sound(run)
+    path = best_of(run) if which == "best" else run / "checkpoints" / f"step-{which:08d}"
+    return _named(path) if path else None
+
+
+def require_checkpoint(run: Path, which: Which = "latest") -> Checkpoint:
+    """As :func:`load_checkpoint`, for a run, a workflow's folder around it, or a checkpoint named by its path.
+
+    Raises
+    ------
+    CheckpointError
+        There is none, or the one that was asked for is damaged.
+    """
+    inner = run / "run"  # a workflow's folder holds its run under this name
+    found = load_checkpoint(inner if (inner / "checkpoints").exists() else run, which)
+    if found is None and which == "best":
+        raise CheckpointError(f"{run} has no best checkpoint: none was measured on unseen poses. Take the newest one")
+    if found is None:
+        raise CheckpointError(f"{run} has no usable checkpoint. Name the folder of a training that has written one")
+    return found
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in a folder that is known to be sound."""
+    return _checkpoint(path, manifest_of(path))
+
+
+def export_weights(checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype | None = None) -> None:
+    """Write a checkpoint's weights (their moving average, where it keeps one) and manifest, without training's state.
+
+    ``dtype``, e.g. torch.bfloat16 or torch.float16, makes the file half as large; networks load it in float32.
+
+    Raises
+    ------
+    CheckpointError
+        A weight does not fit the range of ``dtype``.
+    StorageError
+        It could not be written.
+    """
+    weights = checkpoint.weights(average=True)
+    if dtype is not None:
+        weights = cast_weights(weights, dtype)
+    about = {name: getattr(checkpoint, name) for name in ("step", "recipe", "dataset", "dataset_sha256")}
+    commit_into(folder, {**about, "versions": _versions()}, {WEIGHTS: weights_writer(weights, about)})
+
+
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__}
+
+
+def _newest_sound(run: Path) -> Checkpoint | None:
+    for path in newest_first(run):
+        fault = fault_of(path)
         if fault is None:
             return read_checkpoint(path)
         log.warning("checkpoint %s is damaged (%s); falling back to the one before it", path, fault)
     return None
 
 
-def require_checkpoint(run: Path) -> Checkpoint:
-    """The newest sound checkpoint of a run.
-
-    Raises
-    ------
-    CheckpointError
-        There is none.
-    """
-    found = load_checkpoint(run) or load_checkpoint(run / "run")  # a workflow's folder holds its run under this name
-    if found is None:
-        raise CheckpointError(f"{run} has no usable checkpoint. Name the folder of a training that has written one")
-    return found
+def _is_checkpoint(path: Path) -> bool:
+    is_step = path.name.startswith("step-") and path.parent.name == "checkpoints"
+    return is_step or path.suffix == ".safetensors" or any((path / name).exists() for name in (WEIGHTS, MANIFEST))
 
 
-def export_weights(checkpoint: Checkpoint, folder: Path) -> None:
-    """Copy a checkpoint's weights and manifest, without the optimiser's state."""
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy2(checkpoint.path / _WEIGHTS, folder / _WEIGHTS)
-    manifest = json.loads((checkpoint.path / _MANIFEST).read_text())
-    del manifest["sha256"][_STATE]
-    (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1))
+def _named(path: Path) -> Checkpoint:
+    """The checkpoint that a person asked for by name: damage in it is an error."""
+    is_file = path.suffix == ".safetensors"
+    if is_file and not is_listed(path):
+        return _checkpoint(path, read_header(path))
+    folder = path.parent if is_file else path
+    fault = fault_of(folder, only=path.name if is_file else None)
+    if fault is not None:
+        raise CheckpointError(f"checkpoint {path} is damaged or missing ({fault}). Name another, or the run's folder")
+    return _checkpoint(path, manifest_of(folder))
 
 
-def _write(folder: Path, about: dict[str, Any], weights: dict[str, Tensor], state: dict[str, Any]) -> None:
-    save_file({name: value.contiguous() for name, value in weights.items()}, folder / _WEIGHTS)
-    torch.save(state, folder / _STATE)
-    hashes = {name: _sha256(folder / name) for name in (_WEIGHTS, _STATE)}
-    (folder / _MANIFEST).write_text(json.dumps({**about, "sha256": hashes}, indent=1))
-    for name in (_WEIGHTS, _STATE, _MANIFEST):
-        with open(folder / name, "rb") as file:
-            os.fsync(file.fileno())
-
-
-def read_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint in a folder that is known to be sound."""
-    manifest = json.loads((path / _MANIFEST).read_text())
-    return Checkpoint(path, manifest["step"], manifest["recipe"], manifest["dataset"])
-
-
-def _fault(path: Path) -> str | None:
-    try:
-        manifest = json.loads((path / _MANIFEST).read_text())
-        for name, digest in manifest["sha256"].items():
-            if _sha256(path / name) != digest:
-                return f"sha256 of {name} differs from its manifest"
-    except (OSError, ValueError, KeyError) as error:
-        return f"{type(error).__name__}: {error}"
-    return None
-
-
-def _newest_first(folder: Path) -> Iterator[Path]:
-    yield from sorted(folder.glob("step-*"), reverse=True)
-
-
-def _forget_old(folder: Path, keep: int) -> None:
-    sound = [path for path in _newest_first(folder) if _fault(path) is None]
-    for path in set(_newest_first(folder)) - set(sound[:keep]):
-        shutil.rmtree(path, ignore_errors=True)
-    for path in folder.glob(".partial-*"):
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
+    return Checkpoint(
+        path=path,
+        step=about.get("step", 0),
+        recipe=about.get("recipe", {}),
+        dataset=about.get("dataset", ""),
+        dataset_sha256=about.get("dataset_sha256", ""),
+        versions=about.get("versions", {}),
+        best=about.get("best", False),
+        finished=about.get("finished", False),
+    )

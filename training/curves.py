@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.journal import read_journal
 from training.rasteriser import Floats
 
 
@@ -56,6 +58,95 @@ def training_curve(
     return saved(figure, path)
 
 
+def draw_coefficients(run: Path, path: str | os.PathLike[str]) -> Path | None:
+    """Draw the adaptive coefficients of a run's FFAdaINs over its steps: a panel a block, a label at each curve's end.
+
+    0: only the target's own features modulate; 1: only those mixed with the source's pose code (``alpha`` for scales,
+    ``beta`` for shifts). None where the journal has none, as for the baselines.
+    """
+    curves = _coefficients(read_journal(run / "metrics.jsonl"))
+    blocks = sorted({curve.block for curve in curves})
+    if not blocks:
+        return None
+    lines = -(-len(blocks) // _BLOCKS_ABREAST)
+    figure = Figure(figsize=(8, 2.9 * lines), dpi=DPI, facecolor=PAGE, layout="constrained")
+    grid = figure.subplots(lines, min(len(blocks), _BLOCKS_ABREAST), sharey=True, squeeze=False).ravel()
+    for axes, block in zip(grid, blocks, strict=False):
+        _draw_block(axes, block, [curve for curve in curves if curve.block == block])
+    low, high = grid[0].get_ylim()
+    for axes, block in zip(grid, blocks, strict=False):
+        _label_ends(axes, [curve for curve in curves if curve.block == block], gap=0.075 * (high - low))
+    for axes in grid[len(blocks) :]:
+        axes.set_visible(False)
+    grid[0].set_ylabel("weight of the mixed branch", fontsize=8, color=INK)
+    return saved(figure, path)
+
+
+_BLOCKS_ABREAST = 3
+_NORM_COLORS = ("#3f74c8", "#d9772b", "#2f9e83", "#a868b8")
+
+
+@dataclass(frozen=True)
+class _Curve:
+    block: str
+    label: str
+    color: str
+    dashed: bool
+    steps: Floats
+    values: Floats
+
+
+def _coefficients(rows: Sequence[Mapping[str, float]]) -> list[_Curve]:
+    """Return the curves under alpha/BLOCK.NORM and beta/BLOCK.NORM; a norm has a colour, beta is dashed."""
+    keys = sorted({key for row in rows for key in row if key.startswith(("alpha/", "beta/"))})
+    norms = sorted({key.rpartition(".")[2] for key in keys})
+    found = []
+    for key in keys:
+        kind, _, place = key.partition("/")
+        block, _, norm = place.rpartition(".")
+        color = _NORM_COLORS[norms.index(norm) % len(_NORM_COLORS)]
+        label = f"{'α' if kind == 'alpha' else 'β'} {norm}"
+        found.append(_Curve(block, label, color, kind == "beta", *_points(rows, key)))
+    return [curve for curve in found if len(curve.steps)]
+
+
+def _draw_block(axes: Axes, block: str, curves: Sequence[_Curve]) -> None:
+    _styled(axes, "")
+    axes.set_title(block, fontsize=8, color=INK, loc="left", fontweight="bold", parse_math=False)
+    axes.axhline(0, color="#b9c0c9", linewidth=0.8)
+    for curve in curves:
+        style = (0, (3, 1.5)) if curve.dashed else "-"
+        axes.plot(curve.steps, curve.values, color=curve.color, linestyle=style, linewidth=1.4)
+    last = max(float(curve.steps[-1]) for curve in curves)
+    axes.set_xlim(0, 1.42 * max(last, 1.0))  # room for the labels
+    axes.locator_params(axis="x", nbins=4)
+    axes.set_xlabel("step", fontsize=8, color=INK)
+
+
+def _label_ends(axes: Axes, curves: Sequence[_Curve], *, gap: float) -> None:
+    """Write each curve's name behind its end, moved where ends are close, with a hairline to the curve."""
+    curves = sorted(curves, key=lambda curve: float(curve.values[-1]))
+    places = _apart([float(curve.values[-1]) for curve in curves], gap)
+    for curve, place in zip(curves, places, strict=True):
+        last = float(curve.steps[-1])
+        start = last + 0.06 * axes.get_xlim()[1]
+        axes.plot([last, start], [float(curve.values[-1]), place], color=curve.color, linewidth=0.5)
+        axes.annotate(
+            curve.label, (start, place), xytext=(1.5, 0), textcoords="offset points",
+            fontsize=7, va="center", color=curve.color, annotation_clip=False,
+        )  # fmt: skip
+
+
+def _apart(places: Sequence[float], gap: float) -> list[float]:
+    """Return ascending places, at least ``gap`` apart, moved as little as need be."""
+    found = list(places)
+    for _ in range(100):
+        for above in range(1, len(found)):
+            lack = max(gap - (found[above] - found[above - 1]), 0.0)
+            found[above - 1], found[above] = found[above - 1] - lack / 2, found[above] + lack / 2
+    return found
+
+
 _TERM_COLORS = ("#1d2430", "#3f74c8", "#e08b3c", "#2f9e83", "#a868b8", "#c25b5b", "#8a8f3a", "#5aa9c9")
 
 
@@ -66,13 +157,19 @@ def _keys(rows: Sequence[Mapping[str, float]], prefix: str) -> list[str]:
     return sorted(drawable, key=lambda name: (not name.endswith("total"), name))
 
 
-def _series(rows: Sequence[Mapping[str, float]], key: str) -> tuple[Floats, Floats]:
-    """Return steps and values of one key, in order of step, without what a log scale cannot show."""
+def _points(rows: Sequence[Mapping[str, float]], key: str) -> tuple[Floats, Floats]:
+    """Return steps and finite values of one key, in order of step."""
     pairs = np.array([(row["step"], row[key]) for row in rows if row.get(key) is not None and "step" in row], float)
     pairs = pairs.reshape(-1, 2)
-    pairs = pairs[np.isfinite(pairs).all(1) & (pairs[:, 1] > 0)]
+    pairs = pairs[np.isfinite(pairs).all(1)]
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     return pairs[:, 0], pairs[:, 1]
+
+
+def _series(rows: Sequence[Mapping[str, float]], key: str) -> tuple[Floats, Floats]:
+    """Return steps and values of one key, in order of step, without what a log scale cannot show."""
+    steps, values = _points(rows, key)
+    return steps[values > 0], values[values > 0]
 
 
 def _smooth(values: Floats) -> Floats:

@@ -21,8 +21,8 @@ from datagen.grid import PoseType
 from datagen.mesh import bounding_box, edges_of, write_atomically
 from datagen.store import Dataset, open_dataset
 from training import metrics
+from training.batches import read_batch
 from training.checkpoint import require_checkpoint
-from training.data import read_batch
 from training.inference import load_trained, predict
 from training.recipe import EvaluationRecipe
 

@@ -1,14 +1,18 @@
 """Networks from recipes and checkpoints, and running them over meshes."""
 
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from training.checkpoint import require_checkpoint
-from training.data import Batch
+from training.acceleration import GraphedTransfer
+from training.batches import Batch
+from training.checkpoint import Checkpoint, CheckpointError, require_checkpoint
 from training.networks import build_network
+from training.networks.mixed_counts import MixedCounts
 from training.recipe import NetworkRecipe, TrainingRecipe
+from training.weights import fill_network
 
 _MESHES_AT_ONCE = 8
 
@@ -27,19 +31,39 @@ def load_trained(run: Path) -> tuple[nn.Module, TrainingRecipe, int]:
         The run has no usable checkpoint.
     """
     checkpoint = require_checkpoint(run)
+    if not checkpoint.recipe:
+        raise CheckpointError(f"{run} holds weights without their recipe. Name a run, or weights exported from one")
     recipe = TrainingRecipe.model_validate(checkpoint.recipe)
     network = network_from(recipe.network)
-    network.load_state_dict(checkpoint.weights())
+    load_weights(network, checkpoint)
     return network.eval(), recipe, checkpoint.step
+
+
+def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
+    """Give a network the weights of a checkpoint, their moving average where it keeps one.
+
+    Raises
+    ------
+    CheckpointError
+        They are another network's.
+    """
+    fill_network(network, checkpoint.weights(average=True), where=str(checkpoint.path))
 
 
 @torch.no_grad()
 def predict(network: nn.Module, batch: Batch) -> Tensor:
-    """Output vertices [batch, vertex, 3], a few meshes at a time so that memory stays bounded."""
-    parts = [
-        network(
-            source=batch.source[start : start + _MESHES_AT_ONCE], target=batch.target[start : start + _MESHES_AT_ONCE]
-        )
-        for start in range(0, len(batch.source), _MESHES_AT_ONCE)
-    ]
-    return torch.cat(parts)
+    """Output vertices [batch, vertex, 3] in float32 precision, a few meshes at a time so that memory stays bounded.
+
+    Rows behind a mesh's count are zero. On a GPU a single pair whose shapes have come before is replayed (see
+    :class:`GraphedTransfer`).
+    """
+    parts = [batch.part(start, start + _MESHES_AT_ONCE) for start in range(0, len(batch), _MESHES_AT_ONCE)]
+    if batch.source_counts or batch.target_counts:
+        return torch.cat([_predict_mixed(MixedCounts(network), part) for part in parts])
+    transfer = GraphedTransfer(network)
+    return torch.cat([transfer(source=part.source, target=part.target) for part in parts])
+
+
+def _predict_mixed(network: MixedCounts, batch: Batch) -> Tensor:
+    counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
+    return cast(Tensor, network(source=batch.source, target=batch.target, **counts))

@@ -4,28 +4,49 @@ Training is a pure function of its recipe, so a resumed run would write the same
 checkpoint; the journal drops those, and there are neither gaps nor duplicates.
 """
 
+import errno
 import json
+import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from datagen.errors import StorageError
+
 
 class Journal:
-    """Append-only writer of RUN/metrics.jsonl."""
+    """Append-only writer of RUN/metrics.jsonl; a line is with the operating system once ``write`` returns."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         _drop_torn_line(path)
-        self._last = max((row["step"] for row in read_journal(path)), default=-1)
-        self._file = open(path, "a", buffering=1, encoding="utf-8")  # noqa: SIM115 - open for the whole run
+        self._path, self._last = path, max((row["step"] for row in read_journal(path)), default=-1)
+        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - open for the whole run
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Append one line; steps that are in the journal already are dropped."""
+        """Append one line; steps that are in the journal already are dropped.
+
+        Raises
+        ------
+        StorageError
+            The disk is full; what was written of the line is dropped when the journal is opened again.
+        """
         if step <= self._last:
             return
+        line = json.dumps({"step": step, "time": time.time(), **values}).encode() + b"\n"
+        try:
+            if self._file.write(line) != len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise StorageError(
+                f"could not write {self._path}: {error.strerror}. Run again once there is room"
+            ) from error
         self._last = step
-        self._file.write(json.dumps({"step": step, "time": time.time(), **values}) + "\n")
+
+    def sync(self) -> None:
+        """Wait until the disk has every line; before a checkpoint, lest a power failure leaves a gap before it."""
+        os.fsync(self._file.fileno())
 
     @property
     def next_step(self) -> int:
@@ -61,3 +82,15 @@ def _drop_torn_line(path: Path) -> None:
         if whole < len(content):
             with open(path, "r+b") as file:
                 file.truncate(whole)
+
+
+def coefficient_metrics(network: object) -> dict[str, float]:
+    """Alpha and beta of every FFAdaIN (the adaptive coefficients) as ``alpha/block1.norm1`` and so on.
+
+    Empty for a network without ``adaptive_coefficients()``. A wrapper such as DistributedDataParallel is looked into.
+    """
+    inner = getattr(network, "module", network)
+    if not hasattr(inner, "adaptive_coefficients"):
+        return {}
+    named = ((*name.rpartition("."), value) for name, value in inner.adaptive_coefficients().items())
+    return {f"{kind}/{place}" if place else kind: float(value) for place, _, kind, value in named}

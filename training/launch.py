@@ -4,6 +4,7 @@ Under torchrun: ``torchrun --nproc-per-node 2 -m training.launch RECIPE.yaml DAT
 """
 
 import json
+import logging
 import os
 import signal
 import sys
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from datagen.errors import DsffnetError
+from datagen.errors import DsffnetError, RecipeError
 from datagen.mesh import write_atomically
 from training.ranks import STOP_FILE, TrainingError, TrainingStopped
 from training.recipe import TrainingRecipe
@@ -48,7 +49,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     gpu = _on_gpus(recipe)
     if not gpu:
         recipe = recipe.model_copy(update={"device": "cpu"})
-    _require(recipe.ranks, "GPU" if gpu else "CPU")
+    _require(recipe.fewest_ranks or recipe.ranks, "GPU" if gpu else "CPU")
     run.mkdir(parents=True, exist_ok=True)
     for left_over in (_FAILURE, STOP_FILE):
         (run / left_over).unlink(missing_ok=True)
@@ -58,7 +59,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
         _rank,
         train_loop_config={"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark},
         torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
-        scaling_config=ScalingConfig(num_workers=recipe.ranks, use_gpu=gpu),
+        scaling_config=ScalingConfig(num_workers=_workers(recipe), use_gpu=gpu),
         run_config=RunConfig(
             name="ray", storage_path=str(run.resolve()), failure_config=FailureConfig(max_failures=_RESTARTS)
         ),
@@ -74,6 +75,11 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     failure = _failure_of(run)
     if failure:
         raise failure
+
+
+def _workers(recipe: TrainingRecipe) -> int | tuple[int, int]:
+    """So many, or (elastic) as many as there are nodes for: a lost one is gone on without, a new one is taken in."""
+    return (recipe.fewest_ranks, recipe.ranks) if recipe.fewest_ranks else recipe.ranks
 
 
 def _rank(config: dict[str, Any]) -> None:
@@ -145,14 +151,34 @@ def _require(ranks: int, resource: str) -> None:
         )
 
 
-def main() -> None:
-    """Entry point for torchrun: RECIPE.yaml (a training section) DATA.zarr RUN."""
-    from omegaconf import OmegaConf
+def _recipe_in(path: Path) -> TrainingRecipe:
+    """The training section in a file; JSON needs no YAML reader.
 
-    recipe_path, data, run = sys.argv[1:4]
-    recipe = TrainingRecipe.model_validate(OmegaConf.to_container(OmegaConf.load(recipe_path)))
+    Raises
+    ------
+    RecipeError
+        It cannot be read, or is no such section.
+    """
     try:
-        train(recipe, data=data, run=Path(run))
+        text = path.read_text()
+        if path.suffix == ".json":
+            return TrainingRecipe.model_validate(json.loads(text))
+        import yaml
+
+        return TrainingRecipe.model_validate(yaml.safe_load(text))
+    except (OSError, ValueError) as error:  # pydantic's and JSON's are ValueErrors
+        raise RecipeError(f"{path} is no readable training recipe: {str(error).splitlines()[0]}") from error
+
+
+def main() -> None:
+    """Entry point for torchrun, and for a machine without Ray: RECIPE.yaml|json (a training section) DATA.zarr RUN."""
+    if len(sys.argv) != 4:
+        print("usage: python -m training.launch RECIPE.yaml DATA.zarr RUN", file=sys.stderr)
+        sys.exit(2)
+    recipe_path, data, run = sys.argv[1:]
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    try:
+        train(_recipe_in(Path(recipe_path)), data=data, run=Path(run))
     except DsffnetError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         sys.stdout.flush()

@@ -43,6 +43,12 @@ class TrainingStopped(TrainingError):
     exit_status = 143
 
 
+class BudgetSpent(TrainingStopped):
+    """The time that one command may take is used up; a checkpoint was written. 75 asks a script to try again."""
+
+    exit_status = 75
+
+
 @dataclass(frozen=True)
 class Ranks:
     """Where this process stands among those that train together."""
@@ -50,12 +56,16 @@ class Ranks:
     rank: int
     count: int
     local: int
+    here: int = 1
 
     @classmethod
     def from_environment(cls) -> "Ranks":
-        """As torchrun and Ray Train say it; one process alone where they do not."""
-        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
-        return cls(*(int(os.environ.get(name, default)) for name, default in zip(names, "010", strict=True)))
+        """As torchrun and Ray Train say it; one process alone where they do not. ``here``: ranks of this machine."""
+        rank, count, local = (
+            int(os.environ.get(name, default))
+            for name, default in (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))
+        )
+        return cls(rank, count, local, int(os.environ.get("LOCAL_WORLD_SIZE", count)))
 
 
 def device_of(recipe: TrainingRecipe, ranks: Ranks) -> torch.device:

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import time
+import uuid
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +34,9 @@ class Server:
 class Record:
     """One run as MLflow will show it. ``parent`` and ``artifacts`` are paths relative to the record's folder.
 
+    ``id`` is unique; servers are asked for it before a run is created, so that none is created twice.
     ``model`` is the registered name of the run's weights; it is registered again when ``model_version`` changes.
+    ``measured`` is when ``metrics`` changed, and times are in milliseconds since 1970.
     """
 
     name: str
@@ -46,9 +49,11 @@ class Record:
     model: str | None = None
     model_version: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
+    measured: int | None = None
     status: Status = "RUNNING"
     started: int = 0
     ended: int | None = None
+    id: str = ""
 
 
 def read_record(folder: Path) -> Record | None:
@@ -63,7 +68,7 @@ def write_record(folder: Path, record: Record) -> None:
 
 
 def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, parameters: dict[str, str]) -> Record:
-    """Begin a record, or go on with the one that is there (its start time stays)."""
+    """Begin a record, or go on with the one that is there (its start time and its id stay)."""
     before = read_record(folder)
     record = Record(
         name=name,
@@ -72,16 +77,18 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         parameters=parameters,
         tags={"mlflow.user": _user(), "mlflow.source.name": sys.argv[0], "mlflow.source.type": "LOCAL"},
         started=before.started if before else _now(),
+        id=(before.id if before else "") or uuid.uuid4().hex,
     )
     write_record(folder, record)
     return record
 
 
 def update_record(folder: Path, **changes: Any) -> None:
-    """Change fields of the record that is there."""
+    """Change fields of the record that is there; other ``metrics`` are marked as measured now."""
     record = read_record(folder)
     assert record is not None, f"{folder} has no record to update"
-    write_record(folder, replace(record, **changes))
+    measured = _now() if changes.get("metrics", record.metrics) != record.metrics else record.measured
+    write_record(folder, replace(record, **{"measured": measured, **changes}))
 
 
 def end_record(folder: Path, status: Status) -> None:

@@ -7,8 +7,8 @@ from torch import nn
 
 from datagen.mesh import Mesh, bounding_box, save_mesh
 from datagen.store import Dataset
+from training.batches import read_batch
 from training.curves import training_curve
-from training.data import read_batch
 from training.evaluation import POSE_TYPES, Row, evaluation_list
 from training.figures import TransferExample, transfer_figure
 from training.inference import predict

@@ -1,7 +1,8 @@
 """The MLflow mirror of records (see :mod:`training.record`): the one place that talks to MLflow.
 
 ``publish`` can be repeated at any time, after any outage or kill: what has been sent is noted in FOLDER/mlflow.json
-behind every call, and what is sent twice all the same (the same metric, step and time) MLflow stores once.
+behind every call. What is sent twice all the same is there once: MLflow stores the same point (metric, step, time,
+value) once, and runs and models bear the record's id, by which they are found before they are made a second time.
 """
 
 import hashlib
@@ -12,16 +13,16 @@ import shlex
 import shutil
 import tempfile
 import threading
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
+
 from datagen.errors import DsffnetError
-from datagen.mesh import write_atomically
-from training.journal import journal_from
+from training.outbox import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
 from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, read_record
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
@@ -29,10 +30,13 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_SKIP_PIP_REQUIREMENTS_CHECK", "true")
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
 log = logging.getLogger(__name__)
-_PARENT_TAG = "mlflow.parentRunId"
+_PARENT_TAG, _RECORD_TAG, _WEIGHTS_TAG = "mlflow.parentRunId", "dsffnet.record", "dsffnet.weights"
 _METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER = 900, 90, 5000
+_LOCK_SECONDS = 120.0  # to wait for another process that publishes the same record, such as a sync by hand
+_NO_ANSWER = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "DEADLINE_EXCEEDED", "REQUEST_LIMIT_EXCEEDED")
 
 
 class TrackingError(DsffnetError):
@@ -51,20 +55,37 @@ def publish(root: Path, server: Server) -> None:
 
     for chatty in ("mlflow", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    failures: list[Exception] = []
     try:
         mlflow.set_tracking_uri(server.uri)
         client = mlflow.MlflowClient(server.uri)
         for folder in find_records(root):
-            record = read_record(folder)
-            if record is not None:
-                _Publication(client, server, folder, record).run()
+            _publish_record(client, server, folder, failures)
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
-        log.debug("publishing %s failed", root, exc_info=True)
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        failures.append(error)
+    if failures:
+        log.debug("publishing %s failed", root, exc_info=failures[0])
+        reason = (str(failures[0]).splitlines() or [type(failures[0]).__name__])[0][:200]
         raise TrackingError(
             f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
             f"dsffnet sync {shlex.quote(str(root))} --tracking-uri {shlex.quote(server.uri)} sends what is missing"
-        ) from error
+        ) from failures[0]
+
+
+def _publish_record(client: Any, server: Server, folder: Path, failures: list[Exception]) -> None:
+    """Publish one record. What the server refuses about it is kept for the end, lest it keep back the others."""
+    from mlflow.exceptions import MlflowException
+
+    record = read_record(folder)
+    if record is None:
+        return
+    try:
+        with FileLock(folder / ".mlflow.lock").acquire(timeout=_LOCK_SECONDS):
+            _Publication(client, server, folder, record).run()
+    except MlflowException as error:
+        if error.error_code in _NO_ANSWER:
+            raise
+        failures.append(error)
 
 
 class _Publication:
@@ -72,13 +93,15 @@ class _Publication:
 
     def __init__(self, client: Any, server: Server, folder: Path, record: Record) -> None:
         self.client, self.server, self.folder, self.record = client, server, folder, record
-        self.sent = _read_sent(folder).get(server.uri, {})
+        self.sent = read_sent(folder, server.uri)
 
     def run(self) -> None:
-        if not self._run_exists():
-            self.sent = {"run": self._create_run(), "offsets": {}, "artifacts": {}}
+        run = self._known_run()
+        if run is None:
+            run = self._find_or_create_run()
+            self.sent = {"run": run.info.run_id, "offsets": {}, "artifacts": {}}
             self._note()
-        self._send_parameters()
+        self._send_parameters(run.data)
         if self.record.tags != self.sent.get("tags", {}):
             self._send_tags()
         if self.record.dataset:
@@ -90,44 +113,63 @@ class _Publication:
         if self.record.status != self.sent.get("status"):
             self._send_status()
 
-    def _run_exists(self) -> bool:
+    def _known_run(self) -> Any:
+        """The run that was noted, None where there is none or a person has deleted it."""
         from mlflow.exceptions import MlflowException
 
         if "run" not in self.sent:
-            return False
+            return None
         try:
-            return bool(self.client.get_run(self.sent["run"]).info.lifecycle_stage == "active")
+            run = self.client.get_run(self.sent["run"])
+            return run if run.info.lifecycle_stage == "active" else None
         except MlflowException as error:
             if error.error_code == "RESOURCE_DOES_NOT_EXIST":
-                return False
+                return None
             raise
 
-    def _create_run(self) -> str:
-        tags = {"kind": self.record.kind}
+    def _find_or_create_run(self) -> Any:
+        """The run of this record, which a kill may have kept from being noted; a new one where there is none."""
+        experiment = _experiment(self.client, self.server)
+        if not self._runs_of_record(experiment):
+            self._create_run(experiment)
+        first, *doubles = self._runs_of_record(experiment)
+        for double in doubles:  # a request whose answer was lost is repeated below us, and each makes a run
+            if not double.data.metrics and not double.data.params:
+                self.client.delete_run(double.info.run_id)
+        return first
+
+    def _runs_of_record(self, experiment: str) -> list[Any]:
+        return list(
+            self.client.search_runs(
+                [experiment], f"tags.`{_RECORD_TAG}` = '{self._id}'", order_by=["attributes.start_time ASC"]
+            )
+        )
+
+    @property
+    def _id(self) -> str:
+        """The record's id; a record of an earlier version is told by its start."""
+        return self.record.id or f"{self.record.name} {self.record.started}"
+
+    def _create_run(self, experiment: str) -> None:
+        tags = {"kind": self.record.kind, _RECORD_TAG: self._id}
         if self.record.parent:
-            parent = (self.folder / self.record.parent).resolve()
-            known = _read_sent(parent).get(self.server.uri)
+            known = read_sent((self.folder / self.record.parent).resolve(), self.server.uri)
             if known:  # a run that was copied away from its workflow stands alone
                 tags[_PARENT_TAG] = known["run"]
-        run = self.client.create_run(
-            _experiment(self.client, self.server), start_time=self.record.started, run_name=self.record.name, tags=tags
-        )
-        return str(run.info.run_id)
+        self.client.create_run(experiment, start_time=self.record.started, run_name=self.record.name, tags=tags)
 
-    def _send_parameters(self) -> None:
-        """Parameters once; MLflow lets none change, so what a resumed run has otherwise becomes a tag."""
+    def _send_parameters(self, there: Any) -> None:
+        """Parameters that the server lacks; it lets none change, so what a resumed run has otherwise becomes a tag."""
         from mlflow.entities import Param, RunTag
 
         given = {key: value[:_LONGEST_PARAMETER] for key, value in self.record.parameters.items()}
-        sent = self.sent.get("parameters", {})
-        new = [Param(key, value) for key, value in given.items() if key not in sent]
+        new = [Param(key, value) for key, value in given.items() if key not in there.params]
         for start in range(0, len(new), _PARAMETERS_AT_ONCE):
             self.client.log_batch(self.sent["run"], params=new[start : start + _PARAMETERS_AT_ONCE])
-        tags = [RunTag(f"changed.{key}", value) for key, value in given.items() if sent.get(key, value) != value]
+        changed = {f"changed.{key}": value for key, value in given.items() if there.params.get(key, value) != value}
+        tags = [RunTag(key, value) for key, value in changed.items() if there.tags.get(key) != value]
         if tags:
             self.client.log_batch(self.sent["run"], tags=tags)
-        if new or tags:
-            self._note(parameters=sent | given)
 
     def _send_tags(self) -> None:
         from mlflow.entities import RunTag
@@ -149,52 +191,64 @@ class _Publication:
     def _send_metrics(self) -> None:
         from mlflow.entities import Metric
 
-        for path in sorted(self.folder.glob("*.jsonl")):
-            batch: list[Any] = []
-            offset = self.sent["offsets"].get(path.name, 0)
-            for behind, row in journal_from(path, offset):
-                moment, step = int(row.pop("time") * 1000), row.pop("step")
-                batch += [Metric(key, float(value), moment, step) for key, value in row.items()]
-                if len(batch) >= _METRICS_AT_ONCE:
-                    self._send_batch(batch, path.name, behind)
-                    batch = []
-                offset = behind
-            if batch:
-                self._send_batch(batch, path.name, offset)
+        for name, offset, rows in unsent_rows(self.folder, self.sent["offsets"], values=_METRICS_AT_ONCE):
+            self._send_rows(rows)
+            self.sent["offsets"][name] = offset
+            self._note()
         if self.record.metrics != self.sent.get("metrics", {}):
-            moment = self.record.ended or int(time.time() * 1000)
-            batch = [Metric(key, value, moment, 0) for key, value in self.record.metrics.items()]
-            self.client.log_batch(self.sent["run"], metrics=batch)
+            moment = self.record.measured or self.record.started  # not now: sent twice, it must be the same point
+            points = [Metric(key, value, moment, 0) for key, value in self.record.metrics.items()]
+            self.client.log_batch(self.sent["run"], metrics=points)
             self._note(metrics=self.record.metrics)
 
-    def _send_batch(self, batch: list[Any], name: str, offset: int) -> None:
-        self.client.log_batch(self.sent["run"], metrics=batch)
-        self.sent["offsets"][name] = offset
-        self._note()
+    def _send_rows(self, rows: MetricRows) -> None:
+        from mlflow.entities import Metric
+
+        points = [
+            Metric(key, float(value), int(row["time"] * 1000), row["step"])
+            for row in rows
+            for key, value in row.items()
+            if key not in ("time", "step")
+        ]
+        for start in range(0, len(points), _METRICS_AT_ONCE):
+            self.client.log_batch(self.sent["run"], metrics=points[start : start + _METRICS_AT_ONCE])
 
     def _send_artifacts(self) -> None:
-        for relative in self.record.artifacts:
-            root = self.folder / relative
-            for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
-                if path.is_file() and not path.name.startswith("."):
-                    self._send_artifact(path)
-
-    def _send_artifact(self, path: Path) -> None:
-        name = os.path.relpath(path, self.folder)
-        stamp = f"{path.stat().st_mtime_ns} {path.stat().st_size}"
-        if self.sent["artifacts"].get(name) == stamp:
-            return
-        folder = "" if name.startswith("..") else os.path.dirname(name)
-        self.client.log_artifact(self.sent["run"], str(path), folder or None)
-        self.sent["artifacts"][name] = stamp
-        self._note()
+        for path, name, stamp in unsent_artifacts(self.folder, self.record.artifacts, self.sent["artifacts"]):
+            folder = "" if name.startswith("..") else os.path.dirname(name)
+            self.client.log_artifact(self.sent["run"], str(path), folder or None)
+            self.sent["artifacts"][name] = stamp
+            self._note()
 
     def _register_model(self) -> None:
+        """Log and register the weights, unless a kill came between that and the note."""
+        marks = {_RECORD_TAG: self._id, _WEIGHTS_TAG: self.record.model_version}
+        version = self._registered_version(marks)
+        if version is None:
+            source, model = self._logged_model(marks) or self._log_model(marks)
+            version = self._register_version(source, model, marks)
+        self.client.set_registered_model_alias(self.record.model, ALIAS, version)
+
+    def _registered_version(self, marks: dict[str, str]) -> str | None:
+        found = self.client.search_model_versions(f"run_id='{self.sent['run']}'")
+        same = [each for each in found if each.name == self.record.model and marks.items() <= each.tags.items()]
+        return str(same[0].version) if same else None
+
+    def _logged_model(self, marks: dict[str, str]) -> tuple[str, str] | None:
+        experiment = _experiment(self.client, self.server)
+        found = self.client.search_logged_models([experiment], f"source_run_id = '{self.sent['run']}'")
+        same = [each for each in found if marks.items() <= each.tags.items()]
+        whole = [each for each in same if each.status == "READY"]
+        for part in same:
+            if part not in whole:
+                self.client.delete_logged_model(part.model_id)
+        return (f"models:/{whole[0].model_id}", whole[0].model_id) if whole else None
+
+    def _log_model(self, marks: dict[str, str]) -> tuple[str, str]:
         import mlflow
 
         from training.checkpoint import export_weights, require_checkpoint
 
-        assert self.record.model is not None
         checkpoint = require_checkpoint(self.folder)
         packages = [Path(__file__).parent, Path(__file__).parents[1] / "datagen"]
         with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
@@ -207,11 +261,11 @@ class _Publication:
                 code_paths=code,
                 signature=_signature(),
                 pip_requirements=["torch", "safetensors", "numpy", "scipy", "pydantic", "filelock", "zarr", "trimesh"],
+                tags=marks,
             )
-        name, version = self.record.model, self._register_version(model.model_uri, model.model_id)
-        self.client.set_registered_model_alias(name, ALIAS, version)
+        return model.model_uri, model.model_id
 
-    def _register_version(self, source: str, model: str) -> str:
+    def _register_version(self, source: str, model: str, marks: dict[str, str]) -> str:
         """As log_model's own registration, which prints into the progress bars."""
         from mlflow.exceptions import MlflowException
 
@@ -220,7 +274,9 @@ class _Publication:
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-        version = self.client.create_model_version(self.record.model, source, self.sent["run"], model_id=model)
+        version = self.client.create_model_version(
+            self.record.model, source, self.sent["run"], tags=marks, model_id=model
+        )
         return str(version.version)
 
     def _send_status(self) -> None:
@@ -239,8 +295,7 @@ class _Publication:
 
     def _note(self, **changes: Any) -> None:
         self.sent |= changes
-        state = _read_sent(self.folder) | {self.server.uri: self.sent}
-        write_atomically(self.folder / "mlflow.json", json.dumps(state, indent=1).encode())
+        note_sent(self.folder, self.server.uri, self.sent)
 
 
 @contextmanager
@@ -254,11 +309,6 @@ def _quiet_run(run: str) -> Iterator[None]:
 
 
 _NO_CACHES = shutil.ignore_patterns("__pycache__", "*.pyc", "node_modules")
-
-
-def _read_sent(folder: Path) -> dict[str, Any]:
-    path = folder / "mlflow.json"
-    return dict(json.loads(path.read_text())) if path.exists() else {}
 
 
 def _experiment(client: Any, server: Server) -> str:
@@ -282,8 +332,9 @@ def _signature() -> Any:
 class Mirror:
     """Publishes in the background while a workflow runs; an outage is said once, and made up for later."""
 
-    def __init__(self, root: Path, server: Server, *, every: float = 5.0) -> None:
-        self._root, self._server, self._every = root, server, every
+    def __init__(self, root: Path, server: Server, *, every: float = 5.0, after_failure: float = 30.0) -> None:
+        """``every``: seconds between publications, ``after_failure``: before the next one after an outage."""
+        self._root, self._server, self._every, self._after_failure = root, server, every, after_failure
         self._stop = threading.Event()
         self._failed: TrackingError | None = None
         self._thread = threading.Thread(target=self._follow, name="mlflow-mirror", daemon=True)
@@ -302,11 +353,13 @@ class Mirror:
         pause = 0.1
         while not self._stop.wait(pause):
             self._publish()
-            pause = self._every if self._failed is None else max(30.0, self._every)
+            pause = self._every if self._failed is None else self._after_failure
 
     def _publish(self) -> None:
         try:
             publish(self._root, self._server)
+            if self._failed is not None:
+                log.warning("MLflow at %s is back and has been sent what it missed", self._server.uri)
             self._failed = None
         except TrackingError as error:
             if self._failed is None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datagen.mesh import Mesh, bounding_box, check_mesh
+from training.acceleration import GraphedTransfer, Precision
 from training.inference import load_trained
 
 
@@ -18,13 +19,19 @@ class PoseTransfer:
     >>> posed = transfer(source=load_mesh("pose.obj"), target=load_mesh("person.obj"))    # doctest: +SKIP
     """
 
-    def __init__(self, network: nn.Module) -> None:
-        self._network = network.eval()
+    def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:
+        """Use a network where it is; on a GPU shapes that come again are replayed (see :class:`GraphedTransfer`)."""
+        self._transfer = GraphedTransfer(network.eval(), precision=precision)
+        self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
 
     @classmethod
-    def from_run(cls, run: str | Path) -> "PoseTransfer":
-        """The network of a run folder, with its newest sound weights (CheckpointError where there are none)."""
-        return cls(load_trained(Path(run))[0])
+    def from_run(cls, run: str | Path, *, device: torch.device | str | None = None) -> "PoseTransfer":
+        """The network of a run folder, with its newest sound weights (CheckpointError where there are none).
+
+        It runs on ``device``; by default on a GPU where there is one.
+        """
+        device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        return cls(load_trained(Path(run))[0].to(device))
 
     def __call__(self, *, source: Mesh, target: Mesh) -> Mesh:
         """The target's identity in the source's pose.
@@ -50,8 +57,9 @@ class PoseTransfer:
     def vertices(self, source: NDArray[np.floating], target: NDArray[np.floating]) -> NDArray[np.float64]:
         """Posed vertices [n_target, 3] in the normalised box, from vertices [n_source, 3] and [n_target, 3]."""
         pair = [bounding_box(mesh).normalise(mesh).astype(np.float32)[None] for mesh in (source, target)]
-        output = self._network(source=torch.from_numpy(pair[0]), target=torch.from_numpy(pair[1]))
-        return output[0].double().numpy()
+        inputs = [torch.from_numpy(mesh).to(self._device) for mesh in pair]
+        output = self._transfer(source=inputs[0], target=inputs[1])
+        return output[0].double().cpu().numpy()
 
 
 def _to_scale_of(target: Mesh, vertices: NDArray[np.float64]) -> NDArray[np.float64]:

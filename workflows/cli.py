@@ -7,9 +7,10 @@ from pathlib import Path
 
 from datagen.errors import DatasetError
 from workflows.commands import add_command
-from workflows.console import add_recipe_options, add_tracking_option, guarded, server_of
+from workflows.console import add_recipe_options, add_tracking_option, guarded, server_of, server_of_record
 from workflows.data_commands import add_data_commands
 from workflows.recipe import load_recipe
+from workflows.sweep_command import add_sweep_options, sweep_command
 
 
 def main() -> None:
@@ -97,12 +98,14 @@ _EXAMPLES = {
   dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
     transfer_command: """\
   dsffnet transfer --model runs/quickstart/run --source pose.obj --target person.obj --out posed.obj""",
+    sweep_command: "  dsffnet sweep --trials networks --out runs/networks",
     sync_command: """\
   dsffnet sync runs/quickstart/run
   dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000""",
     recipe_command: """\
   dsffnet recipe --recipe quickstart
-  dsffnet recipe --recipe mine.yaml --set training.batch=16""",
+  dsffnet recipe --recipe mine.yaml --set training.batch=16
+  dsffnet recipe --set training=npt-paper training.steps=100""",
 }
 
 
@@ -129,6 +132,8 @@ def _parser() -> argparse.ArgumentParser:
     add_recipe_options(evaluate)
     add_tracking_option(evaluate)
 
+    add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
+
     transfer = add_command(commands, transfer_command, _EXAMPLES[transfer_command])
     transfer.add_argument("--model", required=True, metavar="RUN", help="run folder of a training")
     transfer.add_argument("--source", required=True, metavar="A", help="mesh in the wanted pose")
@@ -146,9 +151,14 @@ def _parser() -> argparse.ArgumentParser:
 @contextmanager
 def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
     """Keep MLflow up to date with a run folder while the block runs; an outage is an error only at the end."""
+    from training.record import find_records, read_record
     from training.tracking import Mirror
 
-    mirror = Mirror(run, server_of(run.parent, options.tracking_uri))
+    recorded = [folder for folder in find_records(run) if read_record(folder)]
+    server = (
+        server_of_record(recorded[0], options.tracking_uri) if recorded else server_of(run.parent, options.tracking_uri)
+    )
+    mirror = Mirror(run, server)
     mirror.start()
     try:
         yield

@@ -19,10 +19,20 @@ from workflows.cluster import require_reachable
 from workflows.recipe import describe_fields, known_recipes
 
 log = logging.getLogger(__name__)
-_OWN = ("recipe.yaml", "record.json", "mlflow.json", "stages", "generate", "run", "dataset.zarr", "system.jsonl")
+_OWN = (
+    "recipe.yaml",
+    "record.json",
+    "mlflow.json",
+    "stages",
+    "generate",
+    "run",
+    "dataset.zarr",
+    "system.jsonl",
+    ".mlflow.lock",
+)
 _OF_A_RUN = (
     "recipe.yaml", "provenance.json", "record.json", "mlflow.json", "metrics.jsonl", "system.jsonl", "latest", "ray",
-    "checkpoints", "figures", "failure.json", "stop", ".launch",
+    "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", ".mlflow.lock",
 )  # fmt: skip
 
 
@@ -120,7 +130,7 @@ def _sqlite(database: Path) -> Server:
 def server_of_record(root: Path, uri: str | None) -> Server:
     """The server for a record; a run that is no part of a workflow has its SQLite store beside it."""
     record = read_record(root)
-    is_workflow = record is not None and record.kind == "workflow"
+    is_workflow = record is not None and record.kind in ("workflow", "sweep")
     return server_of(root if is_workflow else root.parent, uri)
 
 

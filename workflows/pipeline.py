@@ -18,7 +18,7 @@ from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
 from training.checkpoint import CheckpointError, load_checkpoint, require_checkpoint
-from training.data import TripleOrder
+from training.curves import draw_coefficients
 from training.evaluation import NO_OPS, Row, evaluate, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
@@ -28,6 +28,7 @@ from training.recipe import EvaluationRecipe, TrainingRecipe
 from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
+from training.triples import TripleOrder
 from workflows.console import alone_in
 from workflows.progress import bar, following, sampling
 
@@ -85,18 +86,20 @@ def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | 
 def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     artifacts = ["recipe.yaml", "provenance.json"]
     update_record(run, dataset=about_dataset(dataset), artifacts=artifacts)
-    _write_run_head(recipe, dataset, run)
-    steps = last_step(recipe, dataset)
-    with following(run / "metrics.jsonl", steps=steps, system=run / "system.jsonl"):
+    write_run_head(recipe, dataset, run)
+    order = order_of(recipe, dataset)
+    steps = order.last_step(recipe.epochs, recipe.steps)
+    with following(run / "metrics.jsonl", steps=steps, steps_per_epoch=order.steps_per_epoch):
         launch(recipe, data=dataset.url, run=run)
-    reached = require_checkpoint(run).step
-    if reached < steps:
+    reached = require_checkpoint(run)
+    if not reached.finished:
         raise TrainingError(
-            f"training in {run} ended at step {reached} of {steps}. Run the same command again to go on"
+            f"training in {run} ended at step {reached.step} of {steps}. Run the same command again to go on"
         )
     draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
-    version = f"{dataset.uuid} step {reached}"
-    update_record(run, artifacts=[*artifacts, "metrics.jsonl", "figures"], model=MODEL, model_version=version)
+    draw_coefficients(run, run / "figures" / "adaptive-coefficients.png")
+    artifacts += [name for name in ("metrics.jsonl", "figures", "pictures") if (run / name).exists()]
+    update_record(run, artifacts=artifacts, model=MODEL, model_version=f"{dataset.uuid} step {reached.step}")
 
 
 def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Path | None) -> str:
@@ -154,11 +157,14 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> No
     recipe.require_same_learning(TrainingRecipe.model_validate(found.recipe), where=str(run))
 
 
+def order_of(recipe: TrainingRecipe, dataset: Dataset) -> TripleOrder:
+    """The order of triples of a training on a dataset."""
+    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
+
+
 def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
-    """The step at which a training of this recipe on this dataset ends."""
-    identities = dataset.identities("training")
-    order = TripleOrder(identities, dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
-    return recipe.steps or recipe.epochs * order.steps_per_epoch
+    """The step at which a training of this recipe on this dataset ends, unless early stopping ends it before."""
+    return order_of(recipe, dataset).last_step(recipe.epochs, recipe.steps)
 
 
 def is_complete(data: str) -> bool:
@@ -171,11 +177,11 @@ def is_complete(data: str) -> bool:
 
 
 def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
-    """Whether a run holds a sound checkpoint of this recipe's last step on this dataset."""
+    """Whether a run holds a sound checkpoint of the end of this recipe's training on this dataset."""
     try:
         dataset, found = open_dataset(data), load_checkpoint(run)
         check_run_accepts(recipe, dataset, run)
-        return found is not None and found.step >= last_step(recipe, dataset)
+        return found is not None and found.finished
     except DsffnetError:
         return False
 
@@ -240,7 +246,7 @@ def _emd_points(recipe: EvaluationRecipe, dataset: Dataset) -> int:
     return min(recipe.emd_points, dataset.vertex_count(0))
 
 
-def _write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+def write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     """recipe.yaml (what is trained) and provenance.json (with what, on what), before the work starts."""
     import torch
     import yaml

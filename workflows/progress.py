@@ -1,19 +1,25 @@
-"""What a person sees while something runs: bars on a terminal, a line now and then elsewhere; and system metrics."""
+"""What a person sees while something runs: bars on a terminal, a line now and then elsewhere."""
 
+import shutil
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import psutil
 from tqdm import tqdm
 
-from training.journal import Journal, journal_from
+from training.journal import journal_from
+from training.machine import sampling
+from training.progress import Progress
+
+__all__ = ["bar", "following", "sampling"]
 
 Item = TypeVar("Item")
 _QUIET_SECONDS = 20.0  # between lines where the output is not a terminal
+_BAR_COLUMNS = 24  # of a terminal's width, beside the words about a training
 
 
 def bar(items: Iterable[Item] | None = None, *, total: int, what: str, unit: str, initial: int = 0) -> "tqdm[Item]":
@@ -47,78 +53,81 @@ class _Lines:
 
 
 @contextmanager
-def following(journal: Path, *, steps: int, system: Path) -> Iterator[None]:
-    """Show a training's journal as a bar while the block runs, and sample the machine's load into ``system``."""
+def following(
+    journal: Path, *, steps: int, system: Path | None = None, steps_per_epoch: int | None = None
+) -> Iterator[None]:
+    """Show how a training's journal grows while the block runs, and sample this machine's load into ``system``.
+
+    What the journal holds already is the past: it is shown, but the time left comes from what is added.
+    """
+    follower = _Follower(journal, Progress(steps=steps, steps_per_epoch=steps_per_epoch), steps)
     stop = threading.Event()
-    threads = [
-        threading.Thread(target=_follow, args=(journal, steps, stop), daemon=True),
-        threading.Thread(target=_sample, args=(system, stop), daemon=True),
-    ]
-    for thread in threads:
+    thread = threading.Thread(target=follower.run, args=(stop,), name="progress", daemon=True)
+    with ExitStack() as around:
+        if system is not None:
+            around.enter_context(sampling(system))
         thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        for thread in threads:
+        try:
+            yield
+        finally:
+            stop.set()
             thread.join()
 
 
-@contextmanager
-def sampling(system: Path) -> Iterator[None]:
-    """Sample the machine's load into ``system`` while the block runs."""
-    stop = threading.Event()
-    thread = threading.Thread(target=_sample, args=(system, stop), daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+class _Follower:
+    def __init__(self, journal: Path, progress: Progress, steps: int) -> None:
+        self._journal, self._progress, self._offset = journal, progress, 0
+        self._read(past=True)
+        self._display = _TerminalBar(steps) if sys.stderr.isatty() else _LogLines()
+
+    def run(self, stop: threading.Event) -> None:
+        while True:
+            ending = stop.is_set()
+            if self._read() or ending:
+                self._display.show(self._progress, last=ending)
+            if ending:
+                return
+            stop.wait(0.5)
+
+    def _read(self, *, past: bool = False) -> bool:
+        before = self._offset
+        for behind, row in journal_from(self._journal, before):
+            self._progress.add(row, past=past)
+            self._offset = behind
+        return self._offset > before
 
 
-def _follow(journal: Path, steps: int, stop: threading.Event) -> None:
-    offset, shown = 0, None
-    latest: dict[str, Any] = {}
-    while True:
-        ending = stop.is_set()
-        for behind, row in journal_from(journal, offset):
-            offset, latest = behind, latest | row
-        if latest:
-            shown = shown or bar(total=steps, what="train", unit="step", initial=latest["step"])
-            shown.set_postfix_str(_summary(latest), refresh=False)
-            shown.update(latest["step"] - shown.n)
-        if ending:
-            break
-        stop.wait(0.5)
-    if shown is not None:
-        shown.close()
+class _LogLines:
+    """A line at intervals, and one at the end; no control characters."""
+
+    def __init__(self) -> None:
+        self._said, self._when = "", 0.0
+
+    def show(self, progress: Progress, *, last: bool) -> None:
+        line = progress.line()
+        if line and line != self._said and (last or time.monotonic() - self._when >= _QUIET_SECONDS):
+            print(f"train: {line}", file=sys.stderr, flush=True)
+            self._said, self._when = line, time.monotonic()
 
 
-def _summary(row: dict[str, Any]) -> str:
-    parts = [f"loss {row['loss/total']:.4f}", f"{row['meshes_per_second']:.0f} meshes/s"]
-    if "evaluation/pmd_unseen" in row:
-        parts.insert(1, f"PMD unseen {row['evaluation/pmd_unseen'] * 1e4:.1f}e-4")
-    return ", ".join(parts)
+class _TerminalBar:
+    """A bar, and as many of the words beside it as the terminal has room for."""
 
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._shown: tqdm[None] | None = None
 
-def _sample(path: Path, stop: threading.Event, every: float = 5.0) -> None:
-    """Load of this machine under the names that MLflow gives to system metrics, so that its UI shows them as such."""
-    journal = Journal(path)
-    step, disk, network = journal.next_step, psutil.disk_io_counters(), psutil.net_io_counters()
-    psutil.cpu_percent()
-    while not stop.wait(every):
-        memory = psutil.virtual_memory()
-        values = {
-            "system/cpu_utilization_percentage": psutil.cpu_percent(),
-            "system/system_memory_usage_megabytes": memory.used / 1e6,
-            "system/system_memory_usage_percentage": memory.percent,
-            "system/disk_usage_percentage": psutil.disk_usage(str(path.parent)).percent,
-        }
-        if disk and network:
-            now = psutil.disk_io_counters(), psutil.net_io_counters()
-            values["system/disk_write_megabytes"] = (now[0].write_bytes - disk.write_bytes) / 1e6
-            values["system/network_transmit_megabytes"] = (now[1].bytes_sent - network.bytes_sent) / 1e6
-        journal.write(step, values)
-        step += 1
-    journal.close()
+    def show(self, progress: Progress, *, last: bool) -> None:
+        if progress.step is not None:
+            self._shown = self._shown or tqdm(
+                total=self._steps,
+                bar_format="train {percentage:3.0f}%|{bar}| {desc}",
+                dynamic_ncols=True,
+                file=sys.stderr,
+            )
+            words = progress.line(width=shutil.get_terminal_size().columns - _BAR_COLUMNS)
+            self._shown.set_description_str(words, refresh=False)
+            self._shown.n = progress.step
+            self._shown.refresh()
+        if last and self._shown is not None:
+            self._shown.close()

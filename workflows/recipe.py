@@ -1,22 +1,33 @@
 """The recipe of a whole workflow: its sections, reading it from YAML, overrides, and errors a person can act on."""
 
-import difflib
-import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from datagen.bodies import FAMILIES
 from datagen.errors import RecipeError
 from datagen.poses import SOURCES
-from datagen.recipe import ANIMALS, PATH_KEYS, DatasetRecipe, Frozen
+from datagen.recipe import DatasetRecipe, Frozen
 from training.recipe import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
+from workflows.named_recipes import known_recipes, known_trainings, named_training, nearest
+from workflows.recipe_paths import with_absolute_paths
 
-_FOLDER = Path(__file__).parent / "recipes"
+__all__ = [
+    "WorkflowRecipe",
+    "change_recipe",
+    "check_recipe",
+    "describe_fields",
+    "known_recipes",
+    "load_recipe",
+    "override_values",
+    "recipe_faults",
+    "save_recipe",
+    "with_absolute_paths",
+]
 
 
 class WorkflowRecipe(Frozen):
@@ -27,10 +38,20 @@ class WorkflowRecipe(Frozen):
     training: TrainingRecipe = Field(default_factory=TrainingRecipe)
     evaluation: EvaluationRecipe = Field(default_factory=EvaluationRecipe)
 
-
-def known_recipes() -> dict[str, Path]:
-    """Recipes that come with the project, by name."""
-    return {path.stem: path for path in sorted(_FOLDER.glob("*.yaml"))}
+    @model_validator(mode="after")
+    def _stops_by_what_there_is(self) -> "WorkflowRecipe":
+        sizes = {
+            "data.poses.unseen": self.data.poses.unseen,
+            "data.identities.evaluation": self.data.identities.evaluation,
+            "data.triples.count": self.data.triples.count,
+        }
+        missing = [name for name, size in sizes.items() if size == 0]
+        if self.training.early_stopping and missing:
+            raise ValueError(
+                f"training.early_stopping goes by the PMD on unseen poses, but {missing[0]} is 0: "
+                f"set {missing[0]}, or training.early_stopping=null"
+            )
+        return self
 
 
 def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRecipe:
@@ -53,7 +74,8 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     folder = base.resolve().parent if isinstance(base, Path) else Path.cwd()
     try:
         read = OmegaConf.to_container(OmegaConf.load(base)) if isinstance(base, Path) else base
-        config = OmegaConf.create(with_absolute_paths(read, folder))
+        name, overrides = _named_by(overrides)
+        config = OmegaConf.create(with_absolute_paths(_with_training(read, name), folder))
         changes = OmegaConf.create(override_values(overrides))
         for section, kind, default in _KINDS:
             chosen = OmegaConf.select(changes, f"{section}.{kind}")
@@ -62,8 +84,9 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
         for override in overrides:  # one by one, as a key may count the entries of a list
             key = override.split("=", 1)[0]
             value = OmegaConf.select(OmegaConf.from_dotlist([override]), key)
+            plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
             last = key.rsplit(".", 1)[-1]
-            OmegaConf.update(config, key, with_absolute_paths({last: value}, Path.cwd())[last], merge=True)
+            OmegaConf.update(config, key, with_absolute_paths({last: plain}, Path.cwd())[last], merge=True)
         values = OmegaConf.to_container(config, resolve=True)
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AttributeError, IndexError) as error:
         raise RecipeError(f"recipe {where} cannot be read: {_first_line(error)}") from error
@@ -91,30 +114,25 @@ def override_values(overrides: Sequence[str]) -> dict[str, Any]:
         raise RecipeError(f"--set {' '.join(overrides)} cannot be read: {_first_line(error)}") from error
 
 
-def with_absolute_paths(values: Any, folder: Path) -> Any:
-    """The same with absolute paths of files that lie in ``folder``: tasks run in other folders.
+def _named_by(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The training recipe that ``training=NAME`` asks for, if any, and the other overrides, which refine it."""
+    import yaml
 
-    Raises
-    ------
-    RecipeError
-        On a cluster, where this folder is a copy that is thrown away, a path is relative.
-    """
-    if isinstance(values, dict):
-        return {
-            key: _absolute(value, folder) if key in PATH_KEYS else with_absolute_paths(value, folder)
-            for key, value in values.items()
-        }
-    return [with_absolute_paths(value, folder) for value in values] if isinstance(values, list) else values
+    name, others = None, []
+    for word in overrides:
+        value = yaml.safe_load(word.removeprefix("training=")) if word.startswith("training=") else None
+        if isinstance(value, str):
+            name = value
+        else:
+            others.append(word)
+    return name, others
 
 
-def _absolute(value: Any, folder: Path) -> Any:
-    if not isinstance(value, str) or value in ("", ANIMALS) or not (folder / value).exists():
-        return value
-    if "RAY_ADDRESS" in os.environ and not Path(value).is_absolute():
-        raise RecipeError(
-            f"{value!r} is a relative path, which other machines do not have. On a cluster name a full one"
-        )
-    return str((folder / value).resolve())
+def _with_training(values: Any, name: str | None) -> Any:
+    """The same with a training recipe in the place of its name, or the one named here in the place of any."""
+    if name is None and isinstance(values, dict) and isinstance(values.get("training"), str):
+        name = values["training"]
+    return values if name is None else {**(values or {}), "training": named_training(name)}
 
 
 def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
@@ -156,6 +174,9 @@ def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -
         is_list = get_origin(field.annotation) is tuple
         parts = [] if is_list else list(_parts(field.annotation))
         sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+        if sections == [TrainingRecipe]:
+            names = ", ".join(known_trainings())
+            yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
         for section in sections:
             yield from describe_fields(section, f"{prefix}{name}.")
         if not sections:
@@ -191,7 +212,11 @@ def _find(name_or_file: str) -> Path | dict[str, Any]:
         if path.is_file():
             return path
         raise RecipeError(f"no recipe file {path}")
-    raise RecipeError(f"no recipe {name_or_file!r}{_nearest(name_or_file, list(known))}; there are {', '.join(known)}")
+    if name_or_file in known_trainings():
+        raise RecipeError(
+            f"{name_or_file!r} is a recipe of training only. Add to another: --set training={name_or_file}"
+        )
+    raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
 
 
 def _describe(fault: Any) -> str:
@@ -203,17 +228,15 @@ def _describe(fault: Any) -> str:
         known = [line.split()[0] for line in describe_fields()]
         if key in known:
             return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
-        return f"unknown key {key!r}{_nearest(key, known)}"
-    return f"{key}: {fault['msg']} (given: {fault['input']!r})"
+        return f"unknown key {key!r}{nearest(key, known)}"
+    message = fault["msg"].removeprefix("Value error, ")
+    # of a whole section that does not fit together, the message names the keys
+    given = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    return f"{key}: {message}{given}" if key else f"{message}{given}"
 
 
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _parts(annotation: Any) -> Iterator[Any]:

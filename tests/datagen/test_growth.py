@@ -111,13 +111,14 @@ def test_the_recipe_it_was_first_made_by_does_not_shrink_it(spoilable: Path) -> 
 
 def test_training_sees_appended_identities_and_poses(spoilable: Path) -> None:
     """The bank and the order of triples go by pose number, also where a pose's row is another number."""
-    from training.data import TripleOrder, VertexBank
+    from training.banks import open_bank
+    from training.triples import TripleOrder
 
     grown = append(str(spoilable), training=4, seen=9)
     identities = grown.identities("training")
     assert identities == [0, 1, 2, 5] and grown.grid.poses("seen").tolist() == [0, 1, 2, 3, 4, 5, 10, 11, 12]
-    bank = VertexBank(grown, identities)
-    triples = next(TripleOrder(identities, grown.grid.poses("seen"), batch=36, seed=0).batches(first_step=0))
+    bank = open_bank(grown, identities)
+    triples = next(TripleOrder(identities, grown.grid.poses("seen"), batch=36, seed=0).batches(first_step=0))[0]
     truth = {(target, pose) for _, pose, target, _ in triples.tolist()}
     assert truth == {(identity, pose) for identity in identities for pose in grown.grid.poses("seen").tolist()}
     batch = bank.batch(triples)

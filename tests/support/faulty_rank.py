@@ -3,9 +3,9 @@
 import os
 from typing import Any
 
-from training import launch, trainer
+from training import launch, learner
 
-_real = trainer.pose_transfer_loss
+_real = learner.transfer_loss
 _calls = 0
 
 
@@ -19,5 +19,5 @@ def _faulty(*arguments: Any, **keywords: Any) -> Any:
 
 
 if __name__ == "__main__":
-    trainer.pose_transfer_loss = _faulty
+    learner.transfer_loss = _faulty
     launch.main()

@@ -2,7 +2,14 @@
 
 from pathlib import Path
 
-from training.journal import Journal, journal_from, read_journal
+import pytest
+import torch
+from torch import nn
+
+from datagen.errors import StorageError
+from tests.support.disk import small_disk
+from training.journal import Journal, coefficient_metrics, journal_from, read_journal
+from training.networks import build_network
 
 
 def test_lines_come_back(tmp_path: Path) -> None:
@@ -42,3 +49,34 @@ def test_reading_from_an_offset_goes_on_where_it_was(tmp_path: Path) -> None:
     journal.write(2, {"loss": 2.0})
     assert [row["step"] for _, row in journal_from(path, offset)] == [2]
     assert list(journal_from(tmp_path / "none.jsonl", 0)) == []
+
+
+def test_a_line_is_there_for_others_at_once(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "m.jsonl")
+    journal.write(1, {"loss": 1.0})
+    journal.sync()
+    assert len(read_journal(tmp_path / "m.jsonl")) == 1
+    journal.close()
+
+
+def test_a_full_disk_is_one_error_and_no_torn_line_stays(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", kibibytes=100) as disk:
+        journal = Journal(disk / "m.jsonl")
+        with pytest.raises(StorageError, match=r"could not write .*m\.jsonl: No space left on device"):
+            for step in range(10_000):
+                journal.write(step, {"loss": 0.1234567})
+        journal.close()
+        whole = read_journal(disk / "m.jsonl")
+        journal = Journal(disk / "m.jsonl")
+        assert journal.next_step == len(whole) and (disk / "m.jsonl").read_bytes().endswith(b"\n")
+        journal.close()
+
+
+def test_coefficients_under_the_names_of_their_curves() -> None:
+    network = build_network("dsffnet", encoder_widths=(4, 4, 4), decoder_widths=(4, 4, 4))
+    with torch.no_grad():
+        network.get_parameter("decoder.block1.norm2.alpha").fill_(0.5)
+    found = coefficient_metrics(network)
+    assert found["alpha/block1.norm2"] == 0.5 and found["beta/block3.norm1"] == 0.0 and len(found) == 12
+    assert coefficient_metrics(nn.ModuleDict({"module": network})["module"]) == found
+    assert coefficient_metrics(nn.Linear(2, 2)) == {}

@@ -47,6 +47,16 @@ def test_each_mesh_gets_what_it_gets_alone(network: nn.Module) -> None:
         assert not together[mesh, n_target:].any()
 
 
+def test_pairing_vertices_works_in_mixed_batches_too() -> None:
+    torch.manual_seed(0)
+    network = build_network("npt", encoder_widths=(8, 16, 29), variant="origin").eval()
+    source, target = padded(COUNTS[1], 1), padded(COUNTS[1], 2)
+    together = MixedCounts(network)(source=source, target=target, source_counts=COUNTS[1], target_counts=COUNTS[1])
+    for mesh, count in enumerate(COUNTS[1]):
+        alone = network(source=source[mesh : mesh + 1, :count], target=target[mesh : mesh + 1, :count])
+        assert torch.allclose(together[mesh, :count], alone[0], atol=1e-5)
+
+
 def test_gradients_are_the_sum_of_the_single_ones(network: nn.Module) -> None:
     network = network.double()
     source, target = padded(COUNTS[0], 1).double(), padded(COUNTS[1], 2).double()

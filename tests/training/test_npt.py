@@ -224,8 +224,9 @@ def test_a_gpu_gives_the_same_gradients_every_time_and_those_of_the_cpu(variant:
         torch.testing.assert_close(found[0][name].cpu(), value, rtol=1e-8, atol=1e-8)
 
 
-def test_safetensors_round_trip(tmp_path: Path) -> None:
-    network, other, inputs = _network("maxpool"), _network("maxpool", seed=9), _pair("maxpool")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_safetensors_round_trip(variant: str, tmp_path: Path) -> None:
+    network, other, inputs = _network(variant), _network(variant, seed=9), _pair(variant)
     assert not torch.equal(network(**inputs), other(**inputs))
     save_file(network.state_dict(), tmp_path / "weights.safetensors")
     other.load_state_dict(load_file(tmp_path / "weights.safetensors"))

@@ -2,6 +2,7 @@
 
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,17 @@ from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from training import tracking
 from training.journal import Journal
-from training.record import ALIAS, EXPERIMENT, Server, begin_record, end_record, find_records, flatten, update_record
+from training.record import (
+    ALIAS,
+    EXPERIMENT,
+    Server,
+    begin_record,
+    end_record,
+    find_records,
+    flatten,
+    read_record,
+    update_record,
+)
 from training.tracking import Mirror, TrackingError, publish
 from training.trainer import train
 
@@ -164,6 +175,80 @@ def test_a_run_deleted_on_the_server_is_made_again(root: Path, server: Server) -
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
 
 
+def forget(folder: Path, server: Server, *keys: str) -> None:
+    """As if a kill had come between a call to the server and the note about it."""
+    state = json.loads((folder / "mlflow.json").read_text())
+    for key in keys:
+        state[server.uri].pop(key)
+    (folder / "mlflow.json").write_text(json.dumps(state))
+
+
+def test_a_run_that_a_kill_kept_from_being_noted_is_adopted(root: Path, server: Server) -> None:
+    publish(root, server)
+    before = {name: run.info.run_id for name, run in runs_of(server).items()}
+    for folder in (root, root / "run"):
+        (folder / "mlflow.json").unlink()
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    update_record(root / "run", metrics={"final": 0.5}, parameters={"batch": "9"})
+    publish(root, server)
+    client = mlflow.MlflowClient(server.uri)
+    found = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
+    assert {run.info.run_name: run.info.run_id for run in found} == before and len(found) == 2
+    child = runs_of(server)["train"]
+    assert len(history(server, child, "loss/total")) == 5
+    assert child.data.params == {"batch": "8"} and child.data.tags["changed.batch"] == "9"
+
+
+def test_a_create_request_that_the_client_repeated_leaves_one_run(
+    root: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = mlflow.MlflowClient.create_run
+
+    def twice(*arguments: Any, **keywords: Any) -> Any:
+        real(*arguments, **keywords)
+        return real(*arguments, **keywords)
+
+    monkeypatch.setattr(mlflow.MlflowClient, "create_run", twice)
+    publish(root, server)
+    client = mlflow.MlflowClient(server.uri)
+    assert len(client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])) == 2
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
+def test_summary_metrics_sent_twice_are_one_point_and_a_later_value_wins(root: Path, server: Server) -> None:
+    publish(root, server)
+    forget(root / "run", server, "metrics")
+    publish(root, server)
+    assert len(history(server, runs_of(server)["train"], "final")) == 1
+    update_record(root / "run", metrics={"final": 0.25})
+    publish(root, server)
+    assert runs_of(server)["train"].data.metrics["final"] == 0.25
+
+
+def test_what_the_server_refuses_of_one_record_does_not_keep_back_the_others(root: Path, server: Server) -> None:
+    update_record(root, metrics={"not a name!": 1.0})
+    with pytest.raises(TrackingError, match="not a name!"):
+        publish(root, server)
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
+def test_a_journal_put_back_from_an_older_copy_is_sent_from_its_beginning(root: Path, server: Server) -> None:
+    publish(root, server)
+    path = root / "run" / "metrics.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:2]) + '{"step": 6, "time": 1, "loss/total": 0}\n')
+    publish(root, server)
+    assert [step for step, _ in history(server, runs_of(server)["train"], "loss/total")] == [1, 2, 3, 4, 5, 6]
+
+
+def test_two_processes_that_publish_at_once_make_one_run(root: Path, server: Server) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: publish(root, server), range(4)))
+    client = mlflow.MlflowClient(server.uri)
+    assert len(client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])) == 2
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+
+
 def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Server) -> None:
     """The registered model loads by alias and poses a mesh; the dataset shows as the run's input."""
     run, opened = tmp_path / "run", open_dataset(dataset)
@@ -181,8 +266,30 @@ def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Serv
     assert posed.shape == target.shape and np.isfinite(posed).all()
     (given,) = runs_of(server)["train"].inputs.dataset_inputs
     assert given.dataset.digest == about["manifest_sha256"][:36] and given.dataset.name == "leg.zarr"
+    _never_registered_twice(run, server)
+
+
+def _never_registered_twice(run: Path, server: Server) -> None:
+    """Kills behind the logging of the model, behind its version, and in the middle of its upload."""
+    client = mlflow.MlflowClient(server.uri)
+    experiment = client.get_experiment_by_name(EXPERIMENT).experiment_id
     publish(run, server)
-    assert len(mlflow.MlflowClient(server.uri).search_model_versions("name='dsffnet'")) == 1
+    forget(run, server, "model")
+    publish(run, server)
+    assert len(client.search_model_versions("name='dsffnet'")) == 1, "the version was adopted"
+    client.delete_registered_model("dsffnet")
+    forget(run, server, "model")
+    half = client.create_logged_model(
+        experiment,
+        source_run_id=runs_of(server)["train"].info.run_id,
+        tags={"dsffnet.record": read_record(run).id, "dsffnet.weights": ""},
+    )
+    publish(run, server)
+    (version,) = client.search_model_versions("name='dsffnet'")
+    (model,) = client.search_logged_models([experiment])
+    assert version.source == f"models:/{model.model_id}" != f"models:/{half.model_id}", (
+        "the whole model was adopted, the half one removed"
+    )
 
 
 def test_flatten() -> None:

@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen.errors import RecipeError
+from training.recipe import PATH_KEYS, TrainingRecipe
+from workflows.named_recipes import known_trainings
 from workflows.recipe import WorkflowRecipe, describe_fields, known_recipes, load_recipe, save_recipe
 
 
@@ -79,6 +81,85 @@ def test_a_network_is_chosen_by_name_and_the_keys_of_another_do_not_stay() -> No
         load_recipe("quickstart", ["training.network.name=npt", "training.network.decoder_widths=[8,8,8]"])
 
 
+@pytest.mark.parametrize("name", sorted(known_trainings()))
+def test_a_published_training_stands_for_the_whole_section_over_any_recipe(name: str) -> None:
+    published = load_recipe("quickstart", [f"training={name}"])
+    assert published.training == load_recipe("smal-paper", [f"training={name}"]).training
+    assert published.data == load_recipe("quickstart").data
+    assert published.training.network.model_dump() == type(published.training.network)().model_dump()
+
+
+def test_published_trainings_are_what_their_sources_say() -> None:
+    def chosen(name: str) -> TrainingRecipe:
+        return load_recipe("quickstart", [f"training={name}"]).training
+
+    assert chosen("dsffnet-paper") == TrainingRecipe()
+    released, npt, corenet = map(chosen, ("dsffnet-released", "npt-paper", "corenet3d-paper"))
+    assert (released.learning_rate, released.batch, released.epochs, released.schedule.decay_epochs) == (1e-4, 2, 8, 4)
+    assert (released.edge_reference, released.edge_measure) == ("target", "squared_length")
+    assert (npt.optimiser, npt.learning_rate, npt.batch, npt.schedule.name) == ("adam", 5e-5, 8, "constant")
+    assert (npt.edge_reference, npt.edge_sum, npt.weight_decay) == ("target", "faces", 0)
+    assert (corenet.optimiser, corenet.betas, corenet.epsilon, corenet.learning_rate) == ("adam", (0, 0.9), 1e-3, 1e-4)
+    assert (corenet.schedule.name, corenet.schedule.hold, corenet.edge_weight) == ("linear", 0.5, 0.5)
+    # 1,000 times the mean over coordinates is a third of that times the mean over vertices
+    assert corenet.reconstruction_weight * 3 == pytest.approx(1000) and npt.reconstruction_weight * 3 == pytest.approx(
+        1
+    )
+
+
+@given(st.permutations(["training.steps=100", "training=npt-paper", "training.network.variant=origin"]))
+def test_further_overrides_refine_a_published_training_in_any_order(overrides: list[str]) -> None:
+    recipe = load_recipe("quickstart", overrides).training
+    assert (recipe.steps, recipe.network.name, recipe.learning_rate) == (100, "npt", 5e-5)
+    assert recipe.network.variant == "origin"  # type: ignore[union-attr]
+
+
+def test_a_recipe_file_may_name_a_published_training(tmp_path: Path) -> None:
+    (tmp_path / "r.yaml").write_text("{data: {body: {family: leg}}, training: corenet3d-paper}")
+    file = str(tmp_path / "r.yaml")
+    assert load_recipe(file).training == load_recipe("smoke", ["training=corenet3d-paper"]).training
+    assert load_recipe(file, ["training=npt-paper"]).training.network.name == "npt"
+    assert load_recipe(file, ["training={steps: 7}"]).training.steps == 7  # values are not a name
+
+
+@pytest.mark.parametrize(
+    "recipe, overrides, message",
+    [
+        (
+            "quickstart",
+            ["training=ntp-paper"],
+            "no training recipe 'ntp-paper', did you mean 'npt-paper'",
+        ),
+        ("quickstart", ["training="], "training: "),
+        ("quickstart", ["training=5"], "training: .*given: 5"),
+        ("npt-paper", [], "'npt-paper' is a recipe of training only. Add to another: --set training=npt-paper"),
+    ],
+)
+def test_a_training_that_is_none_is_named(recipe: str, overrides: list[str], message: str) -> None:
+    with pytest.raises(RecipeError, match=message):
+        load_recipe(recipe, overrides)
+
+
+def test_help_names_the_published_trainings() -> None:
+    (line,) = (line for line in describe_fields() if line.startswith("  training = "))
+    assert all(name in line for name in known_trainings()) and len(known_trainings()) == 4
+
+
+def test_what_does_not_fit_together_is_one_line_without_the_whole_section() -> None:
+    with pytest.raises(RecipeError) as raised:
+        load_recipe("quickstart", ["training.batch=9"])
+    assert str(raised.value) == (
+        "recipe quickstart: training: batch 9 cannot be shared equally by 2 ranks. All keys: dsffnet recipe --help"
+    )
+
+
+@pytest.mark.parametrize("key", ["data.poses.unseen", "data.identities.evaluation", "data.triples.count"])
+def test_early_stopping_needs_unseen_poses_to_go_by(key: str) -> None:
+    assert load_recipe("smoke", ["training.early_stopping=3"]).training.early_stopping == 3
+    with pytest.raises(RecipeError, match=f"recipe smoke: training.early_stopping .* but {key} is 0: set {key}, or"):
+        load_recipe("smoke", ["training.early_stopping=3", f"{key}=0"])
+
+
 def test_unknown_names_and_files(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="no recipe 'quikstart', did you mean 'quickstart'"):
         load_recipe("quikstart")
@@ -112,6 +193,26 @@ def test_relative_paths_are_those_beside_the_recipe_file(tmp_path: Path, monkeyp
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
     with pytest.raises(RecipeError, match=r"'m.npz' is a relative path.*name a full one"):
         load_recipe(str(tmp_path / "r.yaml"))
+
+
+@pytest.mark.parametrize("key", sorted(PATH_KEYS))
+def test_paths_of_a_training_become_full_whether_they_exist_or_not(
+    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recipes").mkdir()
+    (tmp_path / "recipes" / "r.yaml").write_text(f"training: {{{key}: there}}")
+
+    def found(*overrides: str) -> str:
+        return str(getattr(load_recipe("recipes/r.yaml", overrides).training, key))
+
+    assert found() == str(tmp_path / "recipes" / "there")
+    assert found(f"training.{key}=here") == found(f"training={{{key}: here}}") == str(tmp_path / "here")
+    assert found(f"training.{key}=~/here") == str(Path.home() / "here")
+    assert found(f"training.{key}=s3://bucket/here") == "s3://bucket/here"
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
+    with pytest.raises(RecipeError, match=r"'there' is a relative path.*name a full one"):
+        found()
 
 
 def test_a_folder_called_animals_is_not_mistaken_for_the_animals(

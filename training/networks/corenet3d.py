@@ -12,6 +12,7 @@ from torch.nn.utils.parametrize import is_parametrized
 from training.networks.correspondence import transport_matrix, warp
 from training.networks.elain import SLOPE, Generator
 from training.networks.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
+from training.networks.shapes import check_pair
 
 INITIAL_GAIN = 0.02
 """Gain of the initial Xavier normal weights (released code)."""
@@ -42,8 +43,7 @@ class CoreNet3D(nn.Module):
     three vertices wide, so a vertex sees its neighbours *in the file's order*. The released code shuffles the vertices
     of every training and test mesh, so that its neighbours are chance ones; train and evaluate alike.
 
-    A NaN or infinity in a mesh makes all output vertices of its pair NaN (norms spread it), and of no other pair:
-    inputs are not searched, and nothing plausible comes of broken ones.
+    A NaN or an infinity in a mesh makes all output vertices of its pair NaN, and of no other pair (see `shapes`).
 
     Parameters
     ----------
@@ -76,6 +76,12 @@ class CoreNet3D(nn.Module):
 
     Under autocast only the generator's wide products use the lower precision: the temperature of the transport would
     magnify an error of a cosine by 33.
+
+    Memory: the matrix K between n and m vertices is held once for the pair at work if it has at most 8,192^2 elements
+    (256 MiB), else not at all; at 28,920 vertices each, where it would take 3.1 GiB, its blocks are computed anew in
+    every pass, forward and backward, and inference adds 1.2 GiB in all (42 s on one core). The correspondence on
+    request holds it twice, and compiled or exported forms hold it too: 6.2 GiB a pair there, and a memory error of
+    PyTorch's where there is less.
 
     Examples
     --------
@@ -132,7 +138,7 @@ class CoreNet3D(nn.Module):
 
     def _described(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the target's features and both meshes' features of unit length."""
-        _check_meshes(source, target, self.theta.weight.dtype)
+        check_pair(source, target, self.theta.weight.dtype)
         with full_precision(source):
             identity = self.features(target)
             theta, phi = self.theta(identity), self.phi(self.features(source))
@@ -204,14 +210,3 @@ def _initialise(network: CoreNet3D) -> None:
     lift = network.generator.lift
     fans = 9 + 3 * lift.out_features  # as PyTorch counts those of a convolution: every place of the kernel has outputs
     nn.init.normal_(lift.weight, 0.0, INITIAL_GAIN * (2 / fans) ** 0.5)
-
-
-def _check_meshes(source: Tensor, target: Tensor, dtype: torch.dtype) -> None:
-    for name, mesh in (("source", source), ("target", target)):
-        if mesh.ndim != 3 or mesh.shape[2] != 3 or mesh.shape[1] < 1 or mesh.dtype != dtype:
-            found = f"{mesh.dtype} of shape {list(mesh.shape)}"
-            raise ValueError(f"{name} must be a {dtype} tensor of shape [batch, vertex, 3], got {found}")
-    if source.shape[0] != target.shape[0]:
-        raise ValueError(
-            f"source and target must be equally many, got shapes {list(source.shape)} and {list(target.shape)}"
-        )

@@ -38,6 +38,8 @@ class DSFFNet(nn.Module):
         False is the ablation "w/o FFAdaIN": the first FFAdaIN of every block keeps its identity branch only (SPAdaIN).
     target_side
         False is the ablation "w/o side target": every FFAdaIN keeps its mixed branch only.
+    initial_mixing
+        Initial alpha and beta of every FFAdaIN: 0 is the paper's.
 
     Notes
     -----
@@ -45,7 +47,7 @@ class DSFFNet(nn.Module):
     parameter                              initial value
     =====================================  ==============================================
     weight, bias of a layer with i inputs  uniform in +-1/sqrt(i) (PyTorch's Conv1d, used by the released code)
-    alpha, beta of FFAdaIN                 0: at first the target's side alone modulates
+    alpha, beta of FFAdaIN                 `initial_mixing`; at 0 the target's side alone modulates at first
     =====================================  ==============================================
 
     What is not computed, and why the result is the same: the covariance of a layer's inputs gives the variance of its
@@ -53,7 +55,9 @@ class DSFFNet(nn.Module):
     together are a quadratic function of the coordinates; the second convolution of a block that narrows is merged with
     the next one; a bias before an instance norm cancels (its gradient is exactly zero).
 
-    Under autocast only the decoder's wide products use the lower precision.
+    Under autocast only the decoder's wide products use the lower precision, and the encoder's search for the largest.
+
+    A NaN or an infinity in a mesh makes all output vertices of its pair NaN, and of no other pair (see `shapes`).
 
     Examples
     --------
@@ -69,11 +73,15 @@ class DSFFNet(nn.Module):
         decoder_widths: tuple[int, int, int] = (256, 1024, 256),
         feature_fusion: bool = True,
         target_side: bool = True,
+        initial_mixing: float = 0.0,
     ) -> None:
         super().__init__()
         _check_options(encoder_widths, decoder_widths, feature_fusion, target_side)
         self.encoder = PoseEncoder(tuple(encoder_widths))
         self.decoder = Decoder(tuple(decoder_widths), encoder_widths[-1], feature_fusion, target_side)
+        for name, parameter in self.named_parameters():
+            if name.endswith((".alpha", ".beta")):
+                nn.init.constant_(parameter, initial_mixing)
 
     def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
         """Return the target ``[b, n_target, 3]`` in the pose of the source ``[b, n_source, 3]``.
@@ -175,8 +183,10 @@ class Decoder(nn.Module):
             (self.block2, self.linear3, self.block3.norm1),
         ):
             first, second = block(active, vertices, probe)
-            hidden = _joined(first, second, block.linear2.weight, following.weight)
-            active = modulated_relu(hidden, vertices, *norm(probe))
+            # Without a name, so that it is gone before the next block.
+            active = modulated_relu(
+                _joined(first, second, block.linear2.weight, following.weight), vertices, *norm(probe)
+            )
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
             first, second = self.block3(active, vertices, probe)
             return 2 * torch.tanh(self._lowered(first, second))
@@ -188,6 +198,8 @@ class Decoder(nn.Module):
         line = normalised_linear(self.lift.weight, centred)
         monomials = (centred.unsqueeze(3) * vertices.unsqueeze(2)).flatten(2)
         coefficients = (line.unsqueeze(2) * scale.unsqueeze(1)).flatten(1, 2)
+        if torch.compiler.is_compiling():  # Inductor lays vertices into the concatenation, with one mesh's strides
+            return torch.relu(torch.baddbmm(vertices @ shift, monomials, coefficients))
         return torch.relu(torch.cat([monomials, vertices], dim=2) @ torch.cat([coefficients, shift], dim=1))
 
     def _lowered(self, first: Tensor, second: Tensor) -> Tensor:

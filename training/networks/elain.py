@@ -31,10 +31,13 @@ class Centred(NamedTuple):
     """``[b, 1, c]``, standard deviation over the vertices."""
 
 
-def centred(features: Tensor) -> Centred:
-    """Take ``[b, n, c]`` features apart."""
+def centred(features: Tensor, constant: Tensor) -> Centred:
+    """Take ``features + constant`` apart, ``[b, n, c]`` and ``[c]``.
+
+    The constant goes to the mean alone: added to features in 16 bits, it and its gradient would drown in rounding.
+    """
     mean = features.mean(dim=1, keepdim=True)
-    return with_deviation(features - mean, mean)
+    return with_deviation(features - mean, mean + constant)
 
 
 def with_deviation(values: Tensor, mean: Tensor) -> Centred:
@@ -125,14 +128,18 @@ class ElaINBlock(nn.Module):
     def forward(self, features: Centred, identity: Identity) -> tuple[Tensor, Tensor]:
         """Return what the shortcut and the last linear map act on, ``[b, n, c]`` each (see `followed_by`)."""
         skipped = nn.functional.leaky_relu_(self.norm_shortcut(features, identity), SLOPE)
-        hidden = self.linear0(nn.functional.leaky_relu_(self.norm0(features, identity), SLOPE))
+        active = nn.functional.leaky_relu_(self.norm0(features, identity), SLOPE)
+        with full_precision(active):  # the spectral norm's own products too, which run when the weight is read
+            weight = cast(Tensor, self.linear0.weight)
+        hidden = nn.functional.linear(active, weight)
         with full_precision(hidden):
-            inner = centred(hidden.to(features.values.dtype))
+            inner = centred(hidden.to(features.values.dtype), cast(Tensor, self.linear0.bias))
         return skipped, nn.functional.leaky_relu_(self.norm1(inner, identity), SLOPE)
 
-    def followed_by(self, following: nn.Linear, skipped: Tensor, inner: Tensor) -> Tensor:
-        """Return ``following`` of the block's output, ``[b, n, o]``; nothing lies between, so the maps are merged.
+    def followed_by(self, following: nn.Linear, skipped: Tensor, inner: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``following`` of the block's output as what varies, ``[b, n, o]``, and the sum of biases, ``[o]``.
 
+        Nothing lies between the two, so the maps are merged.
         The spectral norm iterates whenever a weight is read: each is read once a forward pass.
         """
         with full_precision(skipped):
@@ -140,8 +147,7 @@ class ElaINBlock(nn.Module):
             weight = following.weight @ cast(Tensor, self.linear1.weight)
             weight_skipped = following.weight @ cast(Tensor, self.shortcut.weight)
             bias = following.weight @ cast(Tensor, self.linear1.bias) + following.bias
-        moved = nn.functional.linear(inner, weight, bias)
-        return moved + nn.functional.linear(skipped, weight_skipped)
+        return nn.functional.linear(inner, weight) + nn.functional.linear(skipped, weight_skipped), bias
 
 
 class Generator(nn.Module):
@@ -164,13 +170,14 @@ class Generator(nn.Module):
         with full_precision(warped):
             side, features = Identity.of(identity), self._lifted(warped)
         for block, following in ((self.block1, self.linear2), (self.block2, self.linear3)):
-            hidden = block.followed_by(following, *block(features, side))
+            hidden, bias = block.followed_by(following, *block(features, side))
             with full_precision(warped):
-                features = centred(hidden.to(warped.dtype))
+                features = centred(hidden.to(warped.dtype), bias)
         active = self.block3(features, side)
         with full_precision(warped):
             skipped, inner = (part.to(warped.dtype) for part in active)
-            return 2 * torch.tanh(self.block3.followed_by(self.out, skipped, inner))
+            moved, bias = self.block3.followed_by(self.out, skipped, inner)
+            return 2 * torch.tanh(moved + bias)
 
     def _lifted(self, warped: Tensor) -> Centred:
         """Return the first two layers' output: one linear map of nine numbers, so that centring those centres it."""

@@ -42,10 +42,10 @@ class PoseEncoder(nn.Module):
     def forward(self, source: Tensor) -> Tensor:
         """Return ``[b, widths[-1]]`` for ``[b, n, 3]``."""
         last = self.last.weight
-        rounded = source.dtype == torch.float32 and torch.is_autocast_enabled(source.device.type)
+        searched = _search_precision(source)  # asked before autocast is switched off
         with full_precision(source):
             centred = self._before_last(source)
-            return torch.relu(_largest(last, centred, rounded=rounded) * deviation_after(last, centred))
+            return torch.relu(_largest(last, centred, searched) * deviation_after(last, centred))
 
     def features(self, source: Tensor) -> Tensor:
         """Return ``[b, n, widths[-1]]``, of which `forward` is the maximum over the vertices."""
@@ -125,16 +125,22 @@ class _VarianceAfter(torch.autograd.Function):
         return (weighted * images).sum(dim=0), grad_centred
 
 
-def _largest(weight: Tensor, features: Tensor, *, rounded: bool = False) -> Tensor:
+def _search_precision(features: Tensor) -> torch.dtype:
+    """Return the dtype of products that only decide which is the largest: the ambient autocast's, if there is one."""
+    device = features.device.type
+    if features.dtype == torch.float32 and torch.is_autocast_enabled(device):
+        return torch.get_autocast_dtype(device)
+    return features.dtype
+
+
+def _largest(weight: Tensor, features: Tensor, searched: torch.dtype) -> Tensor:
     """Return the maximum over the vertices of ``weight @ features``, ``[b, c]``, a few channels at a time.
 
-    Where bfloat16 is asked for (`rounded`), it decides which vertex is the largest; the value is exact in any case.
+    Products in the dtype `searched` decide which vertex is the largest; the value there is exact in any case.
     """
     meshes = features.shape[0]
     with torch.no_grad():
-        rows, columns = weight, features.transpose(1, 2)
-        if rounded:
-            rows, columns = rows.bfloat16(), columns.bfloat16()
+        rows, columns = weight.to(searched), features.transpose(1, 2).to(searched)
         parts = [rows] if torch.compiler.is_compiling() else _parts(rows, meshes * features.shape[1])
         # max, not argmax, which takes six times as long on a CPU
         index = torch.cat([torch.bmm(part.expand(meshes, -1, -1), columns).max(dim=2).indices for part in parts], dim=1)

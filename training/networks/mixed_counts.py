@@ -57,8 +57,9 @@ class MixedCounts(nn.Module):
         Raises
         ------
         ValueError
-            If counts do not fit the shapes.
+            If counts do not fit the shapes, or there is no mesh.
         """
+        _check_batch(source, target)
         counts = list(
             zip(_checked("source", source, source_counts), _checked("target", target, target_counts), strict=True)
         )
@@ -75,6 +76,15 @@ class MixedCounts(nn.Module):
         ]
         order = torch.tensor([mesh for meshes in groups.values() for mesh in meshes], device=target.device)
         return torch.cat(parts)[torch.argsort(order)]
+
+
+def _check_batch(source: Tensor, target: Tensor) -> None:
+    shapes = list(source.shape), list(target.shape)
+    if source.ndim != 3 or target.ndim != 3 or source.shape[0] != target.shape[0] or source.shape[0] < 1:
+        raise ValueError(
+            f"source and target must be equally many meshes, [batch, vertex, 3], and at least one, got shapes "
+            f"{shapes[0]} and {shapes[1]}"
+        )
 
 
 def _checked(name: str, meshes: Tensor, counts: Counts | None) -> Counts:

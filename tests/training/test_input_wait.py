@@ -1,0 +1,19 @@
+"""The benchmark of input waiting runs."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_the_benchmark_of_input_waiting_runs() -> None:
+    command = [sys.executable, "-m", "benchmarks.input_wait", "--quick", "--threads", "1", "--device", "cpu"]
+    done = subprocess.run(
+        [*command, "--poses", "20"],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(f"  {cache}" in done.stdout for cache in ("memory", "mapped", "stream")) and "%" in done.stdout

@@ -1,0 +1,147 @@
+"""One step means the same however it is cut: over ranks, over parts, over interruptions, over vertex counts."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from datagen.generate import generate
+from tests.support.ranks import finish, start_ranks
+from tests.support.recipes import tiny_dataset, tiny_training
+from training import trainer
+from training.checkpoint import CheckpointError, require_checkpoint
+from training.journal import read_journal
+from training.ranks import BudgetSpent, TrainingError
+from training.trainer import train
+
+TWENTY = {"steps": 20, "checkpoint_every": 20, "evaluate_every": 20}
+
+
+def losses(run: Path) -> torch.Tensor:
+    return torch.tensor([row["loss/total"] for row in read_journal(run / "metrics.jsonl")], dtype=torch.float64)
+
+
+def same_bits(first: Path, second: Path, *, average: bool = False) -> bool:
+    one, other = (require_checkpoint(run).weights(average=average) for run in (first, second))
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-6), ("float32", 1e-4)])
+def test_one_rank_equals_two_ranks_equals_parts(dataset: str, tmp_path: Path, precision: str, tolerance: float) -> None:
+    given = {**TWENTY, "precision": precision, "average": 0.9}
+    train(tiny_training(**given), data=dataset, run=tmp_path / "one")
+    train(tiny_training(**given, accumulate=2), data=dataset, run=tmp_path / "parts")
+    two = tiny_training(**given, launcher="ray", ranks=2, accumulate=2)
+    results = finish(start_ranks(two, data=dataset, run=tmp_path / "two", count=2))
+    assert [status for status, _ in results] == [0, 0], results
+    for run in ("parts", "two"):
+        assert torch.allclose(losses(tmp_path / run), losses(tmp_path / "one"), rtol=tolerance, atol=0), run
+
+
+def test_three_ranks_share_a_batch_of_four_unequally(dataset: str, tmp_path: Path) -> None:
+    """As when an elastic group has lost a node."""
+    given = {**TWENTY, "precision": "float64"}
+    train(tiny_training(**given), data=dataset, run=tmp_path / "one")
+    three = tiny_training(**given, launcher="ray", ranks=4, fewest_ranks=1)
+    results = finish(start_ranks(three, data=dataset, run=tmp_path / "three", count=3))
+    assert [status for status, _ in results] == [0, 0, 0], results
+    assert torch.allclose(losses(tmp_path / "three"), losses(tmp_path / "one"), rtol=1e-6, atol=0)
+
+
+def test_averaged_weights_resume_to_the_bit_and_are_what_is_evaluated(dataset: str, tmp_path: Path) -> None:
+    whole, stopped, raw = (tmp_path / name for name in ("whole", "stopped", "raw"))
+    train(tiny_training(average=0.9), data=dataset, run=whole)
+    shutil.copytree(whole, stopped)
+    shutil.rmtree(stopped / "checkpoints" / "step-00000008")
+    train(tiny_training(average=0.9), data=dataset, run=stopped)
+    assert same_bits(stopped, whole) and same_bits(stopped, whole, average=True)
+    train(tiny_training(), data=dataset, run=raw)
+    assert same_bits(raw, whole) and not same_bits(raw, whole, average=True)
+    measured = [read_journal(run / "metrics.jsonl")[-1]["evaluation/pmd_unseen"] for run in (whole, raw)]
+    assert measured[0] != measured[1]
+
+
+def test_early_stopping_ends_the_run_for_good(dataset: str, tmp_path: Path) -> None:
+    recipe = tiny_training(steps=400, learning_rate=1e-12, evaluate_every=2, early_stopping=3)
+    reached = train(recipe, data=dataset, run=tmp_path / "run")
+    assert reached < 400
+    rows = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    assert train(recipe, data=dataset, run=tmp_path / "run") == reached
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == rows
+    assert require_checkpoint(tmp_path / "run").finished
+
+
+def test_the_best_checkpoint_is_that_of_the_lowest_unseen_pmd(dataset: str, tmp_path: Path) -> None:
+    recipe = tiny_training(steps=60, learning_rate=0.05, evaluate_every=5, checkpoint_every=20, keep_checkpoints=1)
+    train(recipe, data=dataset, run=tmp_path / "run")
+    rows = [row for row in read_journal(tmp_path / "run" / "metrics.jsonl") if "evaluation/pmd_unseen" in row]
+    best = min(rows, key=lambda row: row["evaluation/pmd_unseen"])
+    assert require_checkpoint(tmp_path / "run", "best").step == best["step"]
+
+
+def test_a_time_budget_stops_with_a_checkpoint_and_the_same_command_goes_on(dataset: str, tmp_path: Path) -> None:
+    recipe = tiny_training(steps=100_000, budget="1s", checkpoint_every=100_000, evaluate_every=100_000)
+    reached = []
+    for _ in range(2):
+        with pytest.raises(BudgetSpent, match=r"budget of 1s is spent at step \d+ of 100000.*same command again"):
+            train(recipe, data=dataset, run=tmp_path / "run")
+        reached.append(require_checkpoint(tmp_path / "run").step)
+    assert 0 < reached[0] < reached[1]
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
+    """As on a GPU, where nobody waits to see: the weights are those before the step all the same."""
+    monkeypatch.setitem(trainer._CHECK_EVERY, "cpu", every)
+    saved: dict[int, dict[str, torch.Tensor]] = {}
+    real = trainer.Learner.step
+
+    def spoiled(self: trainer.Learner, parts: list, **keywords: float) -> dict:
+        number = len(saved) + 1
+        saved[number] = {name: value.clone() for name, value in self.network.state_dict().items()}
+        if number == 6:
+            parts[0].truth[0, 0, 0] = float("nan")
+        last.append(self)
+        return real(self, parts, **keywords)
+
+    last: list[trainer.Learner] = []
+    monkeypatch.setattr(trainer.Learner, "step", spoiled)
+    recipe = tiny_training(steps=40, log_every=40, evaluate_every=40, checkpoint_every=40)
+    with pytest.raises(TrainingError, match=r"not finite at step 6 \(this rank's triples were \[\["):
+        train(recipe, data=dataset, run=tmp_path / "run")
+    assert len(saved) == (6 if every == 1 else 8)
+    before, after = saved[6], last[-1].network.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_fine_tuning_begins_from_a_run_on_any_dataset(dataset: str, tmp_path: Path) -> None:
+    other = str(tmp_path / "other.zarr")
+    generate(tiny_dataset(poses={"seen": 7, "unseen": 4}), other)
+    train(tiny_training(), data=dataset, run=tmp_path / "first")
+    with pytest.raises(CheckpointError, match=r"was trained on dataset.*training\.start_from="):
+        train(tiny_training(), data=other, run=tmp_path / "first")
+    train(tiny_training(start_from=str(tmp_path / "first"), learning_rate=1e-12), data=other, run=tmp_path / "second")
+    first, second = (require_checkpoint(tmp_path / name).weights() for name in ("first", "second"))
+    assert all(torch.allclose(first[name], second[name], atol=1e-6) for name in first)
+
+
+def test_identities_of_different_vertex_counts_train_together(tmp_path: Path) -> None:
+    """Two species of legs: their batches are padded, and the loss of a mesh does not depend on its company."""
+    body = {"family": "mixed", "bodies": [{"family": "leg", "rings": 8, "segments": 4}, {"family": "leg", "rings": 6}]}
+    data = str(tmp_path / "mixed.zarr")
+    generate(tiny_dataset(body=body, identities={"training": 4, "evaluation": 2}), data)
+    given = {**TWENTY, "steps": 60, "precision": "float64"}
+    train(tiny_training(**given), data=data, run=tmp_path / "one")
+    train(tiny_training(**given, accumulate=4), data=data, run=tmp_path / "parts")
+    assert torch.allclose(losses(tmp_path / "one"), losses(tmp_path / "parts"), rtol=1e-5, atol=0)
+    assert losses(tmp_path / "one")[-5:].mean() < losses(tmp_path / "one")[:5].mean()
+
+
+@pytest.mark.parametrize("cache", ["memory", "mapped", "stream"])
+def test_the_cache_changes_no_bit(dataset: str, tmp_path: Path, cache: str) -> None:
+    train(tiny_training(), data=dataset, run=tmp_path / "auto")
+    train(tiny_training(cache=cache, cache_folder=str(tmp_path / "cache")), data=dataset, run=tmp_path / cache)
+    assert same_bits(tmp_path / cache, tmp_path / "auto")

@@ -1,0 +1,67 @@
+"""Random changes of a training batch: another subset of the source's vertices each time, and noise on them.
+
+The paper trains without. Shuffling vertices would change nothing (the networks are invariant to the source's order and
+equivariant to the target's); subsets and noise do.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datagen.random import Stream
+from training.batches import Batch, Counts, counts_of
+from training.recipe import TrainingRecipe
+
+
+class Augmentation:
+    """The augmentation of a recipe, a function of (seed, step, place of the triple in the whole batch).
+
+    So it is the same for any number of ranks and parts and from any cache. A CPU and a GPU draw different numbers.
+    """
+
+    def __init__(self, recipe: TrainingRecipe) -> None:
+        self._vertices, self._noise = recipe.augmentation.vertices, recipe.augmentation.source_noise
+        self._seed = recipe.seed
+
+    def __call__(self, batch: Batch, *, step: int, first: int) -> Batch:
+        """The batch with its sources changed.
+
+        Parameters
+        ----------
+        step
+            Steps done before this one.
+        first
+            Place of the batch's first triple in the whole batch (:meth:`training.triples.TripleOrder.places`).
+        """
+        if self._vertices == 1 and self._noise == 0:
+            return batch
+        counts = batch.source_counts or (batch.source.shape[1],) * len(batch.source)
+        sources = [
+            self._changed(mesh[:count], step=step, place=first + row)
+            for row, (mesh, count) in enumerate(zip(batch.source, counts, strict=True))
+        ]
+        source, kept = _padded(sources)
+        return replace(batch, source=source, source_counts=kept)
+
+    def _changed(self, mesh: Tensor, *, step: int, place: int) -> Tensor:
+        """One source [n, 3]: a random subset in its own order, and noise."""
+        random = _generator(self._seed, step, place, mesh.device)
+        if self._vertices < 1:
+            kept = max(1, round(self._vertices * len(mesh)))
+            subset = torch.randperm(len(mesh), generator=random, device=mesh.device)[:kept]
+            mesh = mesh[subset.sort().values]
+        if self._noise:
+            mesh = mesh + self._noise * torch.randn(mesh.shape, generator=random, device=mesh.device)
+        return mesh
+
+
+def _generator(seed: int, step: int, place: int, device: torch.device) -> torch.Generator:
+    state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step, place)).generate_state(1, np.uint64)
+    return torch.Generator(device).manual_seed(int(state[0]))
+
+
+def _padded(meshes: list[Tensor]) -> tuple[Tensor, Counts | None]:
+    counts = counts_of(np.array([len(mesh) for mesh in meshes]))
+    return torch.nn.utils.rnn.pad_sequence(meshes, batch_first=True), counts

@@ -1,0 +1,126 @@
+"""Where decoded meshes are kept: the fastest place that has room for them, said in words."""
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import psutil
+import torch
+
+from datagen.errors import RecipeError
+
+Cache = Literal["auto", "device", "memory", "mapped", "stream"]
+Place = Literal["device", "memory", "mapped", "stream"]
+
+_DEVICE_SHARE = 0.4  # the rest is for weights and activations, which at 6,890 vertices take far more than meshes
+_MEMORY_SHARE = 0.5
+_DISK_SHARE = 0.8
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class Room:
+    """Free bytes of one place, and the share of them that meshes may take."""
+
+    where: str
+    free: int
+    share: float
+
+    def holds(self, size: int) -> bool:
+        """Whether there is room for that many bytes, and some to spare."""
+        return size <= self.share * self.free
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Where meshes are kept, and why."""
+
+    place: Place
+    why: str
+
+
+def gigabytes(size: float) -> str:
+    """Bytes as a person reads them."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6)):
+        if size >= factor:
+            return f"{size / factor:,.1f} {unit}"
+    return f"{size / 1e3:,.1f} kB"
+
+
+def device_room(device: torch.device) -> Room:
+    """Free memory of a GPU."""
+    return Room("device memory", int(torch.cuda.mem_get_info(device)[0]), _DEVICE_SHARE)
+
+
+def memory_room() -> Room:
+    """Free memory of this machine, or of the container that it runs in."""
+    return Room("memory", min(int(psutil.virtual_memory().available), _container_room()), _MEMORY_SHARE)
+
+
+def _container_room(cgroup: Path = _CGROUP) -> int:
+    """Bytes left within a container's limit (Linux, cgroup v2); files that it has read can be dropped, so are free."""
+    try:
+        limit, used = (int((cgroup / name).read_text()) for name in ("memory.max", "memory.current"))
+        lines = (line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
+        droppable = sum(int(value) for name, value in lines if name in ("active_file", "inactive_file"))
+    except (OSError, ValueError):  # no such file, or the limit is: max
+        return 2**63
+    return max(0, limit - used + droppable)
+
+
+def disk_room(folder: Path) -> Room:
+    """Free space of the disk on which a folder lies or will lie."""
+    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    return Room(f"disk of {folder}", shutil.disk_usage(there).free, _DISK_SHARE)
+
+
+def default_folder() -> Path:
+    """Where memory-mapped files are kept: below DSFFNET_CACHE, or dsffnet in the user's cache folder."""
+    given = os.environ.get("DSFFNET_CACHE")
+    cache = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dsffnet"
+    return cache / "vertices"
+
+
+def choose(
+    cache: Cache, size: int, *, device: torch.device, folder: Path, already_mapped: bool, sharers: int = 1
+) -> Choice:
+    """Where to keep ``size`` bytes of meshes.
+
+    ``auto`` is the first of device memory (on a GPU), memory, and a memory-mapped file that has room, else streaming.
+    Memory must have it once for each of the ``sharers`` processes of this machine; a mapped file they share.
+
+    Raises
+    ------
+    RecipeError
+        A place was asked for that has not so many bytes free.
+    """
+    candidates: list[tuple[Place, int, Callable[[], Room]]] = [
+        ("memory", size * sharers, memory_room),
+        ("mapped", 0 if already_mapped else size, lambda: disk_room(folder)),
+    ]
+    if device.type == "cuda":
+        candidates.insert(0, ("device", size, lambda: device_room(device)))
+    if cache == "device" and device.type != "cuda":
+        cache = "memory"
+    tried = []
+    for place, needed, look in candidates:
+        if cache in ("auto", place):
+            room = look()
+            if room.holds(needed) or (cache == place and needed <= room.free):
+                return Choice(place, _why(place, size, needed, room))
+            tried.append(f"{gigabytes(needed)} are too much for the {room.where} ({gigabytes(room.free)} free)")
+    if cache not in ("auto", "stream"):
+        raise RecipeError(f"training.cache is {cache!r}, but {tried[0]}. Use --set training.cache=auto")
+    return Choice("stream", f"streamed, {gigabytes(size)} in all: {'; '.join(tried) or 'as the recipe says'}")
+
+
+def _why(place: Place, size: int, needed: int, room: Room) -> str:
+    copies = f" ({needed // size} processes: {gigabytes(needed)})" if needed > size else ""
+    if place == "mapped":
+        return f"memory-mapped file: {gigabytes(size)}" + (
+            f", {gigabytes(room.free)} free on the {room.where}" if needed else " that is there already"
+        )
+    return f"{room.where}: {gigabytes(size)} of {gigabytes(room.free)} free{copies}"

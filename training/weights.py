@@ -1,0 +1,124 @@
+"""Weights as files: safetensors that say themselves what they are and whether they are whole; and into a network.
+
+The header of a file of ours holds one JSON object (step, recipe, dataset, and a sha256 over the tensors), so that a
+file copied away from its checkpoint can still be used, and a flipped bit in it is still an error. Files of others,
+without such a header, load as well; then safetensors' own checks are all there is.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from datagen.errors import DsffnetError
+
+_HEADER, _NAMED_AT_MOST = "dsffnet", 3
+
+
+class CheckpointError(DsffnetError):
+    """A run without a usable checkpoint, a damaged one, or one that does not belong to what is asked."""
+
+
+def write_weights(path: Path, weights: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
+    """Write weights by parameter name, and what they are, into one safetensors file."""
+    plain = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
+    header = json.dumps({**about, "tensors_sha256": _digest(plain)})
+    save_file(plain, path, metadata={_HEADER: header})  # one key: with more their order, and so the bytes, would vary
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Weights by parameter name, on the CPU.
+
+    Raises
+    ------
+    CheckpointError
+        The file is missing, cut short, or no safetensors.
+    """
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be read as weights: {error}. Name a sound checkpoint") from error
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What a file of weights says about itself; empty for a file that was not written here.
+
+    Raises
+    ------
+    CheckpointError
+        The file is missing or damaged: its tensors are not those that were written.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get(_HEADER, "{}"))
+    except (OSError, SafetensorError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read as weights: {error}. Name a sound checkpoint") from error
+    expected = header.pop("tensors_sha256", None)
+    if expected is not None and _digest(read_weights(path)) != expected:
+        raise CheckpointError(f"{path} is damaged: its tensors are not those that were written. Copy it again")
+    return dict(header)
+
+
+def cast_weights(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    """Weights with every floating-point tensor in ``dtype``; whole numbers stay as they are.
+
+    Raises
+    ------
+    CheckpointError
+        A finite weight does not fit the range of ``dtype``.
+    """
+    cast = {name: value.to(dtype) if value.is_floating_point() else value for name, value in weights.items()}
+    for name, value in weights.items():
+        if bool((cast[name].isinf() & ~value.isinf()).any()):
+            largest = float(value.abs().max())
+            raise CheckpointError(f"{name} reaches {largest:.3g}, more than {dtype} can hold. Export as bfloat16")
+    return cast
+
+
+def fill_network(network: nn.Module, weights: Mapping[str, Tensor], *, where: str) -> None:
+    """Give a network its weights: every name of it, no other, and of its shapes.
+
+    Raises
+    ------
+    CheckpointError
+        Naming what is missing, unexpected or of another shape; the network is as it was.
+    """
+    own = network.state_dict()
+    other = [
+        f"{name} {list(weights[name].shape)} (the network's is {list(own[name].shape)})"
+        for name in own
+        if name in weights and weights[name].shape != own[name].shape
+    ]
+    faults = [
+        *_some("missing", [f"{name} {list(own[name].shape)}" for name in own if name not in weights]),
+        *_some("unexpected", [f"{name} {list(weights[name].shape)}" for name in weights if name not in own]),
+        *_some("of another shape", other),
+    ]
+    if faults:
+        raise CheckpointError(
+            f"{where} holds weights of another network than this {type(network).__name__}: {'; '.join(faults)}. "
+            "Name a checkpoint of this network, or build the network by the checkpoint's own recipe"
+        )
+    network.load_state_dict(dict(weights))
+
+
+def _some(what: str, names: list[str]) -> Iterator[str]:
+    if names:
+        more = f" and {len(names) - _NAMED_AT_MOST} more" if len(names) > _NAMED_AT_MOST else ""
+        yield f"{what}: {', '.join(names[:_NAMED_AT_MOST])}{more}"
+
+
+def _digest(weights: Mapping[str, Tensor]) -> str:
+    """Return the sha256 over names, types, shapes and bytes of tensors on the CPU."""
+    digest = hashlib.sha256()
+    for name in sorted(weights):
+        value = weights[name]
+        digest.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
+        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
