@@ -14,6 +14,7 @@ from training.networks.modulation import (
     homogeneous,
     modulated_relu,
     pose_probe,
+    rounded_modulated_relu,
     with_zero_gradients,
 )
 from training.networks.rounding import centred_for_autocast
@@ -149,7 +150,7 @@ class ResidualBlock(nn.Module):
         The rest is left to what follows the block, which has cheaper ways of doing it (see `_joined`).
         """
         first = nn.functional.linear(centred_for_autocast(active), self.linear1.weight)
-        return first, centred_for_autocast(modulated_relu(first, vertices, *self.norm2(probe)))
+        return first, rounded_modulated_relu(first, vertices, *self.norm2(probe))
 
 
 class Decoder(nn.Module):
@@ -183,10 +184,9 @@ class Decoder(nn.Module):
             (self.block2, self.linear3, self.block3.norm1),
         ):
             first, second = block(active, vertices, probe)
+            modulate = rounded_modulated_relu if norm is self.block2.norm1 else modulated_relu
             # Without a name, so that it is gone before the next block.
-            active = modulated_relu(
-                _joined(first, second, block.linear2.weight, following.weight), vertices, *norm(probe)
-            )
+            active = modulate(_joined(first, second, block.linear2.weight, following.weight), vertices, *norm(probe))
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
             first, second = self.block3(active, vertices, probe)
             return 2 * torch.tanh(self._lowered(first, second))

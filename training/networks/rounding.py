@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_EVERY = 16
-"""One vertex in this many decides the constant: any constant near the mean will do."""
+SAMPLED = 16
+"""One vertex in this many decides such a constant: any near the mean will do."""
 
 
 def centred_for_autocast(features: Tensor) -> Tensor:
@@ -21,7 +21,7 @@ def centred_for_autocast(features: Tensor) -> Tensor:
     device = features.device.type
     if not torch.is_autocast_enabled(device) or features.dtype != torch.float32:
         return features
-    constant = features.detach()[:, ::_EVERY].mean(dim=1, keepdim=True)
+    constant = features.detach()[:, ::SAMPLED].mean(dim=1, keepdim=True)
     if torch.compiler.is_compiling():
         return (features - constant).to(torch.get_autocast_dtype(device))
     return cast(Tensor, _Centred.apply(features, constant, torch.get_autocast_dtype(device)))  # type: ignore[no-untyped-call]
