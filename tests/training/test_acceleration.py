@@ -91,7 +91,7 @@ def test_what_does_not_bear_tf32_is_shielded_from_it() -> None:
 
 def test_the_constants_taken_before_rounding_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any constants in the first two blocks: output and every gradient are those without, in float64."""
-    from training.networks import dsffnet
+    from training.networks import dsffnet, modulation
 
     torch.manual_seed(0)
     network = build_network("dsffnet", **SMALL["dsffnet"]).double()
@@ -108,11 +108,12 @@ def test_the_constants_taken_before_rounding_change_nothing(monkeypatch: pytest.
     def shifted(features: torch.Tensor) -> torch.Tensor:
         calls[0] += 1
         constants = torch.randn(features.shape[0], 1, features.shape[2], dtype=features.dtype)
-        return features - constants if calls[0] <= 4 else features
+        return features - constants if calls[0] <= 5 else features
 
-    monkeypatch.setattr(dsffnet, "centred_for_autocast", shifted)
+    for module in (dsffnet, modulation):
+        monkeypatch.setattr(module, "centred_for_autocast", shifted)
     found = result()
-    assert calls[0] == 6
+    assert calls[0] == 7
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-8)
 
@@ -410,3 +411,20 @@ def test_a_compiled_network_is_replayed_on_a_gpu() -> None:
     for seed in range(4):
         assert torch.allclose(graphed(**on_gpu(seed)), network(**on_gpu(seed)), atol=1e-5)
     assert is_replayed(twin)
+
+
+def test_inference_in_bfloat16_is_that_of_training_up_to_rounding() -> None:
+    """Without gradients features pass rounded from product to product, and memory is used again."""
+    torch.manual_seed(0)
+    network = build_network("dsffnet", encoder_widths=(16, 32, 64), decoder_widths=(32, 128, 32))
+    meshes = {name: torch.rand(2, 12 * mesh.shape[1], 3) * 2 - 1 for name, mesh in pair().items()}
+    with torch.autocast("cpu", torch.bfloat16):
+        trained = network(**meshes)
+        with torch.no_grad():
+            inferred = network(**meshes)
+            again = network(**meshes)
+    with torch.no_grad():
+        exact = network(**meshes)
+    assert torch.equal(inferred, again)
+    error, rounding = (inferred - trained).square().mean().sqrt(), (trained - exact).square().mean().sqrt()
+    assert 0 < error < 1.5 * rounding < 0.02

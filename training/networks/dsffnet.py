@@ -147,10 +147,12 @@ class ResidualBlock(nn.Module):
     def forward(self, active: Tensor, vertices: Tensor, probe: Tensor) -> tuple[Tensor, Tensor]:
         """Return, after the first FFAdaIN and ReLU, the first summand without bias and what the second layer acts on.
 
-        The rest is left to what follows the block, which has cheaper ways of doing it (see `_joined`).
+        The rest is left to what follows the block, which has cheaper ways of doing it (see `_joined`). Without
+        gradients, the place of `active` in memory is used again.
         """
-        first = nn.functional.linear(centred_for_autocast(active), self.linear1.weight)
-        return first, rounded_modulated_relu(first, vertices, *self.norm2(probe))
+        active = centred_for_autocast(active)
+        first = nn.functional.linear(active, self.linear1.weight)
+        return first, rounded_modulated_relu(first, vertices, *self.norm2(probe), room=active)
 
 
 class Decoder(nn.Module):
@@ -185,8 +187,9 @@ class Decoder(nn.Module):
         ):
             first, second = block(active, vertices, probe)
             modulate = rounded_modulated_relu if norm is self.block2.norm1 else modulated_relu
-            # Without a name, so that it is gone before the next block.
-            active = modulate(_joined(first, second, block.linear2.weight, following.weight), vertices, *norm(probe))
+            joined = _joined(first, second, block.linear2.weight, following.weight)
+            active = modulate(joined, vertices, *norm(probe), room=joined)
+            del joined
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
             first, second = self.block3(active, vertices, probe)
             return 2 * torch.tanh(self._lowered(first, second))

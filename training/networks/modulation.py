@@ -107,7 +107,13 @@ def posed_map(layer: nn.Linear, probe: Tensor) -> Tensor:
 
 
 def modulated_relu(
-    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, *, normalised: bool = True
+    hidden: Tensor,
+    vertices: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    *,
+    normalised: bool = True,
+    room: Tensor | None = None,
 ) -> Tensor:
     """Return ``relu(IN(hidden) * sigma + mu)``.
 
@@ -121,6 +127,9 @@ def modulated_relu(
         ``[b, 4, c]``: ``sigma = vertices @ scale`` and ``mu = vertices @ shift``.
     normalised
         False leaves the instance norm out: ``relu(hidden * sigma + mu)``.
+    room
+        An array that is not needed any more, `hidden` itself perhaps: where no gradient is wanted, the result may take
+        its place, as fresh memory costs as much time as the arithmetic.
 
     Returns
     -------
@@ -130,7 +139,8 @@ def modulated_relu(
     hidden = hidden.to(vertices.dtype)
     with full_precision(hidden):
         if not torch.compiler.is_compiling():
-            return cast(Tensor, _ModulatedRelu.apply(hidden, vertices, scale, shift, normalised))  # type: ignore[no-untyped-call]
+            room = _usable(room, hidden)
+            return cast(Tensor, _ModulatedRelu.apply(hidden, vertices, scale, shift, normalised, room))  # type: ignore[no-untyped-call]
         # A compiler fuses the plain expression, and could not unroll an unknown number of chunks.
         if normalised:
             hidden = hidden - hidden.mean(dim=1, keepdim=True)
@@ -138,24 +148,35 @@ def modulated_relu(
         return torch.relu(hidden * (vertices @ scale) + vertices @ shift)
 
 
-def rounded_modulated_relu(hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+def rounded_modulated_relu(
+    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, *, room: Tensor | None = None
+) -> Tensor:
     """Return `modulated_relu` as `rounding.centred_for_autocast` then takes it, in fewer passes over memory.
 
     In inference under autocast on a CPU, features pass from one wide product to the next in the precision of the
     products: arrays of twice the size in between would take longer than the products themselves.
     """
     if torch.is_grad_enabled() or hidden.dtype == vertices.dtype or hidden.device.type != "cpu":
-        return centred_for_autocast(modulated_relu(hidden, vertices, scale, shift))
+        return centred_for_autocast(modulated_relu(hidden, vertices, scale, shift, room=room))
     with full_precision(hidden):
-        return _rounded_modulated_relu(hidden, vertices, scale, shift)
+        return _rounded_modulated_relu(hidden, vertices, scale, shift, _usable(room, hidden))
 
 
-def _rounded_modulated_relu(hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+def _usable(room: Tensor | None, hidden: Tensor) -> Tensor | None:
+    """`room` if a result of the kind of `hidden` may and can be written there."""
+    fits = room is not None and room.shape == hidden.shape and room.dtype == hidden.dtype and room.is_contiguous()
+    return room if fits and not torch.is_grad_enabled() else None
+
+
+def _rounded_modulated_relu(
+    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, room: Tensor | None
+) -> Tensor:
     mean, deviation = _statistics(hidden, vertices.dtype)
     scaled = scale * deviation
     sample = (hidden[:, ::SAMPLED] - mean).mul_(vertices[:, ::SAMPLED] @ scaled).add_(vertices[:, ::SAMPLED] @ shift)
     constant = sample.clamp_min_(0).mean(dim=1, keepdim=True)
-    output, centred, sigma = torch.empty_like(hidden), _scratch(hidden, vertices), _scratch(hidden, vertices)
+    output = torch.empty_like(hidden) if room is None else room
+    centred, sigma = _scratch(hidden, vertices), _scratch(hidden, vertices)
     for chunk in _chunks(hidden):
         rows = vertices[:, chunk]
         size = rows.shape[1]
@@ -169,11 +190,20 @@ class _ModulatedRelu(torch.autograd.Function):
     """Few passes over memory: chunks stay in cache, and sums over vertices are products with four rows."""
 
     @staticmethod
-    def forward(ctx: Any, hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, normalised: bool) -> Tensor:
+    def forward(
+        ctx: Any,
+        hidden: Tensor,
+        vertices: Tensor,
+        scale: Tensor,
+        shift: Tensor,
+        normalised: bool,
+        room: Tensor | None,
+    ) -> Tensor:
         ctx.normalised = normalised
         mean, deviation = _statistics(hidden, hidden.dtype) if normalised else _no_statistics(hidden)
         scaled = scale * deviation
-        output, centred, sigma = torch.empty_like(hidden), _scratch(hidden), _scratch(hidden)
+        output = torch.empty_like(hidden) if room is None else room
+        centred, sigma = _scratch(hidden), _scratch(hidden)
         for chunk in _chunks(hidden):
             rows, part = vertices[:, chunk], output[:, chunk]
             product = torch.bmm(rows, scaled, out=sigma[:, : rows.shape[1]])
@@ -200,7 +230,7 @@ class _ModulatedRelu(torch.autograd.Function):
         _normalisation_gradient(
             gradient, hidden, vertices, scale * deviation, mean * along_hidden - along_one, -along_hidden
         )
-        return gradient, grad_vertices, grad_scale, grad_shift, None
+        return gradient, grad_vertices, grad_scale, grad_shift, None, None
 
 
 def _statistics(hidden: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
