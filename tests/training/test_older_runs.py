@@ -63,7 +63,7 @@ def test_a_recipe_with_unknown_keys_is_named_and_its_weights_serve(dataset: str,
     folder = make_older(run, older_recipe() | {"forgotten": 3})
     with pytest.raises(CheckpointError, match=rf"{folder}.*training\.forgotten: Extra inputs"):
         train(tiny_training(), data=dataset, run=run)
-    network, recipe, step = load_trained(run)
+    _, recipe, step = load_trained(run)
     assert step == 8 and recipe.network == tiny_training().network
     make_older(run, older_recipe() | {"network": {"name": "dsffnet", "forgotten": 3}})
     with pytest.raises(CheckpointError, match=r"training\.network\.dsffnet\.forgotten"):
