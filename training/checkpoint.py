@@ -44,6 +44,7 @@ __all__ = [
     "Checkpoint",
     "CheckpointError",
     "export_weights",
+    "is_finished",
     "load_checkpoint",
     "read_checkpoint",
     "require_checkpoint",
@@ -51,7 +52,9 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
-Which = Literal["latest", "best"] | int
+Which = Literal["latest", "best", "result"] | int
+"""The newest sound one; the best; that of a step; or a run's result: the newest, but where early stopping ended the
+run, the best."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class Checkpoint:
     """One sound checkpoint: its folder (or file of weights), the step, and what it was trained by, on and with.
 
     ``dataset`` is the dataset's uuid, ``dataset_sha256`` the sha256 of its manifest ("" where it was not noted).
-    ``finished``: training had come to its end there, by its steps or by early stopping.
+    ``finished``: training had come to its end there, by its steps or by early stopping; ``earlier``: a version that did
+    not note this wrote it (see :func:`is_finished`). ``last_step``: the last that its recipe asked for, where noted.
     """
 
     path: Path
@@ -70,6 +74,8 @@ class Checkpoint:
     versions: dict[str, str] = field(default_factory=dict)
     best: bool = False
     finished: bool = False
+    earlier: bool = False
+    last_step: int | None = None
 
     def weights(self, *, average: bool = False) -> dict[str, Tensor]:
         """Weights by parameter name, on the CPU; ``average``: their moving average, if this training keeps one."""
@@ -138,7 +144,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
-    """A checkpoint of a run: the newest sound one, the best, or that of a step; None where there is none.
+    """A checkpoint of a run, see :data:`Which`; None where there is none.
 
     A damaged newest one is passed over with a warning that names it, and the one before it is taken. Where ``run`` is
     itself a checkpoint (a step's folder, exported weights, a .safetensors file), that one and no other is meant.
@@ -150,8 +156,9 @@ def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
     """
     if _is_checkpoint(run):
         return _named(run)
-    if which == "latest":
-        return _newest_sound(run)
+    if which in ("latest", "result"):
+        found = _newest_sound(run)
+        return load_checkpoint(run, "best") or found if which == "result" and _was_cut_short(found) else found
     path = best_of(run) if which == "best" else run / "checkpoints" / f"step-{which:08d}"
     return _named(path) if path else None
 
@@ -174,8 +181,22 @@ def require_checkpoint(run: Path, which: Which = "latest") -> Checkpoint:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint in a folder that is known to be sound."""
-    return _checkpoint(path, manifest_of(path))
+    """The checkpoint in a folder that is known to be sound.
+
+    Raises
+    ------
+    CheckpointError
+        It cannot be read from here.
+    """
+    try:
+        return _checkpoint(path, manifest_of(path))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read: {error}. --out must be on a shared disk") from error
+
+
+def is_finished(checkpoint: Checkpoint, last_step: int) -> bool:
+    """Whether training had come to its end there, for checkpoints of earlier versions too."""
+    return checkpoint.finished or checkpoint.step >= last_step
 
 
 def export_weights(checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype | None = None) -> None:
@@ -195,6 +216,11 @@ def export_weights(checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype |
         weights = cast_weights(weights, dtype)
     about = {name: getattr(checkpoint, name) for name in ("step", "recipe", "dataset", "dataset_sha256")}
     commit_into(folder, {**about, "versions": _versions()}, {WEIGHTS: weights_writer(weights, about)})
+
+
+def _was_cut_short(found: Checkpoint | None) -> bool:
+    """Whether early stopping ended the run there."""
+    return found is not None and found.finished and found.step < (found.last_step or 0)
 
 
 def _versions() -> dict[str, str]:
@@ -237,4 +263,6 @@ def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
         versions=about.get("versions", {}),
         best=about.get("best", False),
         finished=about.get("finished", False),
+        earlier="finished" not in about,
+        last_step=about.get("last_step"),
     )

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from training.acceleration import GraphedTransfer
 from training.batches import Batch
-from training.checkpoint import Checkpoint, CheckpointError, require_checkpoint
+from training.checkpoint import Checkpoint, Which, require_checkpoint
+from training.earlier import recipe_of
 from training.networks import build_network
 from training.networks.mixed_counts import MixedCounts
 from training.recipe import NetworkRecipe, TrainingRecipe
@@ -22,18 +23,18 @@ def network_from(recipe: NetworkRecipe) -> nn.Module:
     return build_network(recipe.name, **recipe.model_dump(exclude={"name"}))
 
 
-def load_trained(run: Path) -> tuple[nn.Module, TrainingRecipe, int]:
-    """The network of a run with its newest sound weights, the recipe it was trained by, and the step.
+def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, TrainingRecipe, int]:
+    """The network of a run with its weights, the recipe it was trained by, and the step.
+
+    The weights are the newest sound ones or, where early stopping ended the run, the best; or those of ``which``.
 
     Raises
     ------
     CheckpointError
-        The run has no usable checkpoint.
+        The run has no usable checkpoint, or its network is none of this version.
     """
-    checkpoint = require_checkpoint(run)
-    if not checkpoint.recipe:
-        raise CheckpointError(f"{run} holds weights without their recipe. Name a run, or weights exported from one")
-    recipe = TrainingRecipe.model_validate(checkpoint.recipe)
+    checkpoint = require_checkpoint(run, which)
+    recipe = recipe_of(checkpoint, network_only=True)
     network = network_from(recipe.network)
     load_weights(network, checkpoint)
     return network.eval(), recipe, checkpoint.step

@@ -39,14 +39,24 @@ class Journal:
             if self._file.write(line) != len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            raise StorageError(
-                f"could not write {self._path}: {error.strerror}. Run again once there is room"
-            ) from error
+            raise self._unwritten(error) from error
         self._last = step
 
     def sync(self) -> None:
-        """Wait until the disk has every line; before a checkpoint, lest a power failure leaves a gap before it."""
-        os.fsync(self._file.fileno())
+        """Wait until the disk has every line; before a checkpoint, lest a power failure leaves a gap before it.
+
+        Raises
+        ------
+        StorageError
+            The disk is full or out of order.
+        """
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._unwritten(error) from error
+
+    def _unwritten(self, error: OSError) -> StorageError:
+        return StorageError(f"could not write {self._path}: {error.strerror}. Run again once there is room")
 
     @property
     def next_step(self) -> int:

@@ -3,13 +3,14 @@
     step -> for each part of the batch: forward, loss, backward -> clip -> optimiser, schedule, average
 
 A step whose gradient is not finite changes nothing, nor does any after it: the fused optimisers leave weights and
-state alone where a flag on the device says so. Nobody waits for that flag: the trainer reads it now and then.
+state alone where a flag on the device says so. Nobody waits for that flag: the trainer reads it now and then, and
+before it writes anything. (The average of the weights moves on towards the weights that stay; the trainer ends there,
+without a checkpoint, so that this average is neither kept nor evaluated.)
 """
 
 import contextlib
 import functools
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,9 +19,10 @@ from torch.nn.parallel import DistributedDataParallel
 
 from training.acceleration import autocast, compiled, products
 from training.batches import Batch
-from training.checkpoint import Checkpoint, require_checkpoint
+from training.checkpoint import Checkpoint
 from training.inference import load_weights, network_from
 from training.losses import transfer_loss
+from training.networks.elain import iterated_once
 from training.networks.mixed_counts import MixedCounts
 from training.optimisation import WeightAverage, build_optimiser, build_schedule
 from training.ranks import Ranks
@@ -41,22 +43,31 @@ class Learner:
         Where it learns.
     steps_per_epoch, steps
         What the schedule spans.
+    start
+        Whose weights to begin from instead of random ones.
     """
 
     def __init__(
-        self, recipe: TrainingRecipe, ranks: Ranks, device: torch.device, *, steps_per_epoch: int, steps: int
+        self,
+        recipe: TrainingRecipe,
+        ranks: Ranks,
+        device: torch.device,
+        *,
+        steps_per_epoch: int,
+        steps: int,
+        start: Checkpoint | None = None,
     ) -> None:
         self.recipe, self._ranks, self._device = recipe, ranks, device
         self.dtype = torch.float64 if recipe.precision == "float64" else torch.float32
         torch.manual_seed(recipe.seed)
         network = network_from(recipe.network)
-        if recipe.start_from:
-            load_weights(network, require_checkpoint(Path(recipe.start_from)))
+        if start:
+            load_weights(network, start)
         self.network = network.to(device, self.dtype)
         self.optimiser = build_optimiser(self.network, recipe)
         self.schedule = build_schedule(self.optimiser, recipe, steps_per_epoch=steps_per_epoch, steps=steps)
         self.average = WeightAverage(self.network, recipe.average) if recipe.average else None
-        self._not_finite = torch.zeros((), device=device)
+        self._bad_step = torch.zeros((), dtype=torch.int64, device=device)
 
     def step(self, parts: Sequence[Batch], *, share: float = 1.0) -> dict[str, Tensor | float]:
         """Learn from the parts of this rank's share of a batch; returns losses, gradient norm and learning rate.
@@ -66,10 +77,11 @@ class Learner:
         self.optimiser.zero_grad(set_to_none=True)
         meshes = sum(len(part.source) for part in parts)
         found: dict[str, Tensor] = {}
-        for number, part in enumerate(parts):
-            weight = share * len(part.source) / meshes
-            for name, value in self._backward(part, weight, last=number == len(parts) - 1).items():
-                found[name] = found[name] + value * weight if number else value * weight
+        with self._spectral_norms():
+            for number, part in enumerate(parts):
+                weight = share * len(part.source) / meshes
+                for name, value in self._backward(part, weight, last=number == len(parts) - 1).items():
+                    found[name] = found[name] + value * weight if number else value * weight
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))
         rate = self.schedule.get_last_lr()[0]
         self._apply(norm, found["total"])
@@ -77,9 +89,9 @@ class Learner:
         return values | {"gradient_norm": norm, "learning_rate": rate}
 
     @property
-    def finite(self) -> bool:
-        """Whether every step so far was finite on this rank; waits for the device."""
-        return not bool(self._not_finite)
+    def bad_step(self) -> int:
+        """The first step that was not finite on this rank, counted from 1; 0 if there is none. Waits for the device."""
+        return int(self._bad_step)
 
     def evaluated(self) -> contextlib.AbstractContextManager[Any]:
         """While the block runs, the network has the weights that are to be evaluated: the average, if there is one."""
@@ -91,9 +103,16 @@ class Learner:
         return state | ({"averaged": self.average.state_dict()["updates"]} if self.average else {})
 
     def load(self, found: Checkpoint, state: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint and its state."""
+        """Go on from a checkpoint and its state.
+
+        The groups of the optimiser keep the implementation that was chosen here: a step that is not finite is left out
+        by the fused one alone.
+        """
+        ours = [{name: group[name] for name in ("fused", "foreach")} for group in self.optimiser.param_groups]
+        theirs = state["optimiser"]
+        groups = [group | chosen for group, chosen in zip(theirs["param_groups"], ours, strict=True)]
         fill_network(self.network, found.weights(), where=str(found.path))
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.optimiser.load_state_dict({**theirs, "param_groups": groups})
         self.schedule.load_state_dict(state["schedule"])
         if self.average:
             self.average.load_state_dict({"updates": state["averaged"], "weights": found.weights(average=True)})
@@ -132,15 +151,21 @@ class Learner:
         model = MixedCounts(compiled(self.network, self._device) if self.recipe.compile else self.network)
         return DistributedDataParallel(model) if self._ranks.count > 1 else model
 
+    @contextlib.contextmanager
+    def _spectral_norms(self) -> Iterator[None]:
+        with products(self.recipe.precision), iterated_once(self.network):
+            yield
+
     def _in_step_with_others(self, last: bool) -> contextlib.AbstractContextManager[Any]:
         """Gradients are averaged over ranks once, in the last part's backward pass."""
         model = self.model
         return model.no_sync() if isinstance(model, DistributedDataParallel) and not last else contextlib.nullcontext()
 
     def _apply(self, norm: Tensor, loss: Tensor) -> None:
-        finite = torch.isfinite(norm) & torch.isfinite(loss)
-        self._not_finite = torch.maximum(self._not_finite, (~finite).to(self._not_finite.dtype))
-        self.optimiser.found_inf = self._not_finite  # type: ignore[attr-defined]  # read by fused optimisers
+        bad = ~(torch.isfinite(norm) & torch.isfinite(loss)) & (self._bad_step == 0)
+        self._bad_step = torch.where(bad, self.schedule.done + 1, self._bad_step)
+        flag = (self._bad_step > 0).float()
+        self.optimiser.found_inf = flag  # type: ignore[attr-defined]  # read by fused optimisers
         self.optimiser.step()
         self.schedule.step()
         if self.average:

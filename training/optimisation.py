@@ -17,9 +17,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from training.recipe import ScheduleRecipe, TrainingRecipe
 
-ONE_CYCLE_WARM_UP = 0.1
-"""Fraction of the steps that a one-cycle schedule rises in, where the recipe says none."""
-
 ONE_CYCLE_FIRST = 1 / 25
 """A one-cycle schedule's first factor (PyTorch's ``OneCycleLR``, ``div_factor``)."""
 
@@ -68,7 +65,7 @@ def schedule_factor(recipe: ScheduleRecipe, step: int, *, steps_per_epoch: int, 
     steps
         Steps of the whole run, which all other schedules span.
     """
-    rise = steps * warm_up(recipe)
+    rise = steps * recipe.rise
     step = min(step, steps)
     if recipe.name == "one_cycle" and step < rise:
         return ONE_CYCLE_FIRST + (1 - ONE_CYCLE_FIRST) * (1 - _cosine_fall(step / rise))
@@ -81,13 +78,6 @@ def schedule_factor(recipe: ScheduleRecipe, step: int, *, steps_per_epoch: int, 
     falls_from = recipe.hold * steps if recipe.name == "linear" else rise
     fallen = max(0.0, step - falls_from) / max(steps - falls_from, 1e-9)  # held to the end: never falls
     return warmed * (1 - fallen if recipe.name == "linear" else _cosine_fall(fallen))
-
-
-def warm_up(recipe: ScheduleRecipe) -> float:
-    """Return the fraction of the steps in which the learning rate rises."""
-    if recipe.warm_up is None:
-        return ONE_CYCLE_WARM_UP if recipe.name == "one_cycle" else 0.0
-    return recipe.warm_up
 
 
 def _cosine_fall(part: float) -> float:
@@ -112,6 +102,11 @@ class Schedule:
     def __init__(self, optimiser: torch.optim.Optimizer, rate: Callable[[int], float]) -> None:
         self._optimiser, self._rate, self._done = optimiser, rate, 0
         self._set()
+
+    @property
+    def done(self) -> int:
+        """Steps done."""
+        return self._done
 
     def step(self) -> None:
         """Say that a step of the optimiser is done."""

@@ -1,34 +1,56 @@
 """Looking at a network while it trains: PMD on a fixed subset, the best so far, patience, pictures; rank 0 alone."""
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from datagen.errors import DatasetError
 from datagen.store import Dataset
 from training.batches import Batch, read_batch
 from training.inference import predict
 from training.journal import coefficient_metrics
 from training.metrics import point_mesh_distance
+from training.rasteriser import Integers
 from training.recipe import TrainingRecipe
 from training.snapshots import draw_snapshot
+from training.triples import Triples
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an evaluation means for the run: the best PMD so far, evaluations since then, whether this was it."""
+    """What an evaluation means for the run: the best PMD so far, evaluations since then, whether this was it.
+
+    ``triples``: of how many triples of each pose type the PMD is a mean.
+    """
 
     best: float = float("inf")
     since: int = 0
     improved: bool = False
+    triples: int | None = None
 
     def after(self, pmd: float) -> "Verdict":
         """The verdict after one more evaluation."""
-        return Verdict(pmd, 0, True) if pmd < self.best else Verdict(self.best, self.since + 1, False)
+        if pmd < self.best:
+            return replace(self, best=pmd, since=0, improved=True)
+        return replace(self, since=self.since + 1, improved=False)
+
+    @classmethod
+    def resumed(cls, state: Mapping[str, Any], *, triples: int) -> "Verdict":
+        """The verdict of a checkpoint; a best over other triples is no measure of these, and is forgotten."""
+        found = cls(**state)
+        if found.triples in (None, triples):
+            return replace(found, triples=triples)
+        log.info("evaluate_triples was %s and is %s: the best PMD so far is forgotten", found.triples, triples)
+        return cls(triples=triples)
 
     def gives_up(self, patience: int | None) -> bool:
         """Whether the best is so old that training ends (early stopping)."""
@@ -47,11 +69,14 @@ class Probe:
 
     def __init__(self, dataset: Dataset, recipe: TrainingRecipe, device: torch.device, dtype: torch.dtype) -> None:
         self._batches: dict[str, Batch] = {}
+        self._faces: Integers | None = None
         for pose_type in ("seen", "unseen"):
             triples = dataset.evaluation_triples(pose_type)[: recipe.evaluate_triples]
             if len(triples):
                 self._batches[pose_type] = read_batch(dataset, triples, padded=True).in_dtype(dtype).to(device)
-                self._faces = dataset.faces(triples[0, 2])
+                self._faces = _common_faces(dataset, triples)
+        if recipe.picture_every and self._faces is None:
+            log.info("no pictures while training: the evaluation triples are none, or of several topologies")
 
     def measure(self, network: nn.Module) -> dict[str, float]:
         """``evaluation/pmd_seen``, ``evaluation/pmd_unseen`` and, where there are, the adaptive coefficients."""
@@ -68,9 +93,29 @@ class Probe:
 
     def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
         """A picture of a few fixed transfers, of unseen poses where there are; bodies of one topology only."""
-        batch = list(self._batches.values())[-1]
-        if isinstance(batch.edges, Tensor):
-            draw_snapshot(network, batch, self._faces, path, title)
+        if self._faces is not None:
+            draw_snapshot(network, list(self._batches.values())[-1], self._faces, path, title)
+
+
+def require_measurable(dataset: Dataset, recipe: TrainingRecipe) -> None:
+    """Refuse early stopping where there is nothing to go by.
+
+    Raises
+    ------
+    DatasetError
+        The dataset lists no evaluation triples.
+    """
+    if recipe.early_stopping and not any(len(dataset.evaluation_triples(kind)) for kind in ("seen", "unseen")):
+        raise DatasetError(
+            f"training.early_stopping is {recipe.early_stopping}, but {dataset.url} lists no evaluation triples to go "
+            "by. Use --set training.early_stopping=null, or a dataset with evaluation identities"
+        )
+
+
+def _common_faces(dataset: Dataset, triples: Triples) -> Integers | None:
+    """Faces [f, 3] of all meshes of some triples; None where they differ."""
+    first, *others = (dataset.faces(identity) for identity in sorted({*triples[:, [0, 2]].flatten().tolist()}))
+    return first if all(np.array_equal(first, other) for other in others) else None
 
 
 def _pmd(prediction: Tensor, batch: Batch) -> Tensor:
@@ -85,6 +130,8 @@ def _pmd(prediction: Tensor, batch: Batch) -> Tensor:
 def _evaluating(network: nn.Module) -> Iterator[None]:
     """The network in evaluation mode, without gradients."""
     network.eval()
-    with torch.no_grad():
-        yield
-    network.train()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        network.train()

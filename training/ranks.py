@@ -9,14 +9,14 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from datagen.errors import DsffnetError
+from datagen.errors import DsffnetError, StorageError
 from training.recipe import TrainingRecipe
 
 _Answer = TypeVar("_Answer")
@@ -89,7 +89,11 @@ def any_rank(flags: list[bool], ranks: Ranks) -> list[bool]:
 
 
 def mean_over_ranks(values: dict[str, Tensor | float], ranks: Ranks) -> dict[str, float]:
-    """Means over the ranks, whose shares of a batch are equal; the means over the batch, that is."""
+    """Means over the ranks of what each has; of losses these are the means over the batch.
+
+    A rank whose share of the batch is larger or smaller than the mean has weighted its losses by it before (``share``
+    of :meth:`training.learner.Learner.step`). The gradient norm and the learning rate are the same everywhere.
+    """
     shared = torch.tensor([float(value) for value in values.values()], dtype=torch.float64)
     if ranks.count > 1:
         if dist.get_backend() == "nccl":
@@ -139,15 +143,53 @@ def alone_in(run: Path, ranks: Ranks) -> Iterator[None]:
         lock.release()
 
 
+def agreed(ranks: Ranks, do: Callable[[], _Answer], *, what: str) -> _Answer:
+    """The answer of ``do``, which must talk to no other rank; where it fails on one rank, every rank raises.
+
+    Parameters
+    ----------
+    what
+        What is done, in words, for the ranks that did not fail.
+    """
+    answer: Any = None
+    failure: Exception | None = None
+    try:
+        answer = do()
+    except Exception as error:  # whatever it is, the others must not wait in their next exchange
+        failure = _as_told(error)
+    if any_rank([failure is not None], ranks)[0]:
+        raise failure or TrainingError(f"another rank could not {what}; see what it says", secondary=True)
+    return cast(_Answer, answer)
+
+
+def gathered(value: _Answer, ranks: Ranks) -> list[_Answer]:
+    """The values of all ranks, in their order."""
+    if ranks.count == 1:
+        return [value]
+    values: list[Any] = [None] * ranks.count
+    dist.all_gather_object(values, value)
+    return values
+
+
+def _as_told(error: Exception) -> Exception:
+    """An error of the file system as what a person is told; any other as it is."""
+    if not isinstance(error, OSError):
+        return error
+    told = StorageError(f"{error.filename or 'a file of the run'}: {error.strerror or error}. Mend it and run again")
+    told.__cause__ = error
+    return told
+
+
 def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
     """What rank 0 decides, on every rank; where it cannot, every rank raises."""
     answer: list[Any] = [None, None]
-    failure: DsffnetError | None = None
+    failure: Exception | None = None
     if ranks.rank == 0:
         try:
             answer[0] = decide()
-        except DsffnetError as error:
-            failure, answer[1] = error, str(error)
+        except Exception as error:  # whatever it is, the others must not wait for an answer
+            failure = _as_told(error)
+            answer[1] = str(failure)
     if ranks.count > 1:
         dist.broadcast_object_list(answer, src=0)
     if failure:
@@ -155,6 +197,20 @@ def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
     if answer[1] is not None:
         raise TrainingError(answer[1], secondary=True)
     return answer[0]
+
+
+def forget_old_stop(run: Path, ranks: Ranks, *, before: float) -> None:
+    """Rank 0 removes a RUN/stop that is older than this training; ``before`` in seconds since the epoch.
+
+    Not for a launcher that keeps the file itself: there it may be meant for ranks that were not up yet.
+    """
+
+    def remove() -> None:
+        with contextlib.suppress(FileNotFoundError):
+            if (run / STOP_FILE).stat().st_mtime < before:
+                (run / STOP_FILE).unlink()
+
+    decided_by_first(ranks, remove)
 
 
 class StopRequest:

@@ -31,6 +31,9 @@ __all__ = [
     "budget_seconds",
 ]
 
+ONE_CYCLE_WARM_UP = 0.1
+"""Fraction of the steps that a one-cycle schedule rises in, where the recipe says none."""
+
 _BUDGET = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|h)")
 _SECONDS = {"s": 1, "min": 60, "h": 3600}
 
@@ -68,6 +71,13 @@ class ScheduleRecipe(Frozen):
         None, ge=0, lt=1, description="fraction of the steps spent rising; default: one_cycle 0.1, others 0"
     )
     hold: float = Field(0.5, ge=0, le=1, description="linear: fraction of the steps before it falls (3D-CoreNet: 0.5)")
+
+    @property
+    def rise(self) -> float:
+        """The fraction of the steps in which the learning rate rises, where none is given too."""
+        if self.warm_up is None:
+            return ONE_CYCLE_WARM_UP if self.name == "one_cycle" else 0.0
+        return self.warm_up
 
     @model_validator(mode="after")
     def _rises_before_it_falls(self) -> "ScheduleRecipe":
@@ -203,13 +213,18 @@ class TrainingRecipe(Frozen):
         changed = [
             f"training.{name}: {getattr(other, name)} there, {getattr(self, name)} here"
             for name in type(self).model_fields
-            if name not in ignored and getattr(self, name) != getattr(other, name)
+            if name not in ignored and _meant(getattr(self, name)) != _meant(getattr(other, name))
         ]
         if changed:
             raise RecipeError(
                 f"{where} was trained by another recipe ({'; '.join(changed)}). "
                 "Choose another --out, or add --fresh to start over"
             )
+
+
+def _meant(value: object) -> object:
+    """A field's value with what its defaults stand for, so that a default may be spelled out on resume."""
+    return value.model_copy(update={"warm_up": value.rise}) if isinstance(value, ScheduleRecipe) else value
 
 
 PATH_KEYS = frozenset({"start_from", "cache_folder"})

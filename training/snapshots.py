@@ -98,8 +98,10 @@ class _Row:
 
 def _rows(network: nn.Module, batch: Batch, faces: Integers) -> list[_Row]:
     was_training = network.training
-    output = predict(network.eval(), batch)
-    network.train(was_training)
+    try:
+        output = predict(network.eval(), batch)
+    finally:
+        network.train(was_training)
     pmd = point_mesh_distance(output, batch.truth).tolist()
     parts = {"source": batch.source, "target": batch.target, "output": output, "truth": batch.truth}
     arrays = {role: part.detach().cpu().double().numpy() for role, part in parts.items()}

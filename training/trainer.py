@@ -12,36 +12,39 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+import torch.distributed as dist
 
-from datagen.errors import DsffnetError
 from datagen.store import Dataset, open_dataset
 from training.augmentation import Augmentation
-from training.banks import open_bank
+from training.banks import Bank, open_bank
 from training.batches import Batch
-from training.checkpoint import CheckpointError, load_checkpoint, read_checkpoint, save_checkpoint
+from training.checkpoint import Checkpoint, is_finished, save_checkpoint
+from training.earlier import state_of
 from training.journal import Journal
 from training.learner import Learner
 from training.machine import sampling
 from training.meter import Meter
-from training.probe import Probe, Verdict
+from training.not_finite import broken_step, stop_for
+from training.probe import Probe, Verdict, require_measurable
 from training.progress import Progress
 from training.random_states import random_states, restore_random_state
 from training.ranks import (
     BudgetSpent,
     Ranks,
     StopRequest,
-    TrainingError,
     TrainingStopped,
+    agreed,
     alone_in,
     any_rank,
     decided_by_first,
     device_of,
+    forget_old_stop,
     mean_over_ranks,
     process_group,
 )
 from training.recipe import TrainingRecipe, budget_seconds
+from training.resume import checkpoint_to_go_on_from, weights_to_begin_from
 from training.snapshots import snapshot_path
 from training.triples import TripleOrder
 
@@ -78,12 +81,28 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
     TrainingError, DatasetError, CheckpointError, StorageError
         See their messages; the last good checkpoint is kept.
     """
-    began = time.monotonic()
+    began, now = time.monotonic(), time.time()
     ranks = Ranks.from_environment()
     device = device_of(recipe, ranks)
-    with process_group(ranks, recipe), alone_in(run, ranks), StopRequest(run) as stop:
-        # The trainer must be gone before its process group is: see tests/training/one_rank.py.
-        return _Trainer(recipe, open_dataset(data), run, ranks, device, stop, began).run()
+    launched = dist.is_initialized()  # by Ray Train, whose driver keeps RUN/stop
+    with process_group(ranks, recipe), alone_in(run, ranks):
+        if not launched:
+            forget_old_stop(run, ranks, before=now)
+        with StopRequest(run) as stop:
+            dataset = agreed(ranks, lambda: open_dataset(data), what="open the dataset")
+            found = checkpoint_to_go_on_from(recipe, dataset, run, ranks)
+            if found and is_finished(found, _order(recipe, dataset)[1]):
+                return found.step
+            require_measurable(dataset, recipe)
+            # The trainer must be gone before its process group is: see tests/training/one_rank.py.
+            return _Trainer(recipe, dataset, run, ranks, device, stop, began, found).run()
+
+
+def _order(recipe: TrainingRecipe, dataset: Dataset) -> tuple[TripleOrder, int]:
+    """The order of triples, and the step at which training ends."""
+    identities = dataset.identities("training")
+    order = TripleOrder(identities, dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
+    return order, order.last_step(recipe.epochs, recipe.steps)
 
 
 class _Trainer:
@@ -96,24 +115,19 @@ class _Trainer:
         device: torch.device,
         stop: StopRequest,
         began: float,
+        found: Checkpoint | None,
     ) -> None:
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
         self.device, self._stop, self._began = device, stop, began
-        identities = dataset.identities("training")
-        self.order = TripleOrder(identities, dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
-        self.last_step = self.order.last_step(recipe.epochs, recipe.steps)
-        self.bank = open_bank(
-            dataset,
-            identities,
-            device=device,
-            cache=recipe.cache,
-            folder=recipe.cache_folder,
-            sharers=ranks.here,
-            edge_sum=recipe.edge_sum,
+        self.order, self.last_step = _order(recipe, dataset)
+        start = None if found else weights_to_begin_from(recipe, ranks)
+        self.learner = Learner(
+            recipe, ranks, device, steps_per_epoch=self.order.steps_per_epoch, steps=self.last_step, start=start
         )
-        self.learner = Learner(recipe, ranks, device, steps_per_epoch=self.order.steps_per_epoch, steps=self.last_step)
-        self.done, self.verdict, self.finished = 0, Verdict(), False
-        self._resume()
+        self.done, self.verdict, self.finished = 0, Verdict(triples=recipe.evaluate_triples), False
+        if found:
+            agreed(ranks, lambda: self._go_on_from(found), what="go on from the newest checkpoint")
+        self.bank = agreed(ranks, self._opened_bank, what="open the training meshes")
         self.meter = Meter(recipe.batch)
         self.progress = Progress(steps=self.last_step, steps_per_epoch=self.order.steps_per_epoch)
         self._said = time.monotonic()
@@ -121,22 +135,38 @@ class _Trainer:
         self.stopping = self.out_of_time = False
         self._recent: list[tuple[int, Any, Any]] = []
 
+    def _opened_bank(self) -> Bank:
+        return open_bank(
+            self.dataset,
+            self.dataset.identities("training"),
+            device=self.device,
+            cache=self.recipe.cache,
+            folder=self.recipe.cache_folder,
+            sharers=self.ranks.here,
+            edge_sum=self.recipe.edge_sum,
+        )
+
     def run(self) -> int:
-        self.probe = Probe(self.dataset, self.recipe, self.device, self.learner.dtype) if self.is_writer else None
-        self.journal = Journal(self.folder / "metrics.jsonl") if self.is_writer else None
-        if self.is_writer:
-            log.info("training meshes are kept in %s", self.bank.where)
         with contextlib.ExitStack() as around:
             around.callback(self.bank.close)
-            if self.journal:
-                around.callback(self.journal.close)
-                around.enter_context(sampling(self.folder / "system.jsonl"))
+            agreed(self.ranks, lambda: self._watch(around), what="open the run's journal and evaluation triples")
+            (self.stopping,) = any_rank([self._stop.made()], self.ranks)  # told to while meshes were decoded
             batches = self._batches()
             while self.done < self.last_step and not (self.finished or self.stopping or self.out_of_time):
                 self._step(batches)
         if self.done < self.last_step and not self.finished:
             self._stopped_early()
         return self.done
+
+    def _watch(self, around: contextlib.ExitStack) -> None:
+        """Open what rank 0 alone writes to and measures with."""
+        self.probe, self.journal = None, None
+        if self.is_writer:
+            log.info("training meshes are kept in %s", self.bank.where)
+            self.probe = Probe(self.dataset, self.recipe, self.device, self.learner.dtype)
+            self.journal = Journal(self.folder / "metrics.jsonl")
+            around.callback(self.journal.close)
+            around.enter_context(sampling(self.folder / "system.jsonl"))
 
     def _step(self, batches: Iterator[tuple[Any, list[Batch]]]) -> None:
         """One step, and what is due after it."""
@@ -177,38 +207,33 @@ class _Trainer:
 
     def _agree_to_go_on(self) -> None:
         """One exchange between the ranks: whether any gradient was not finite, and whether any was told to stop."""
-        bad = not self.learner.finite
+        bad_step = self.learner.bad_step
         recent, self._recent = self._recent, []
-        any_bad, self.stopping, self.out_of_time = any_rank([bad, self._stop.made(), self._spent()], self.ranks)
+        flags = [bad_step > 0, self._stop.made(), self._spent()]
+        any_bad, self.stopping, self.out_of_time = any_rank(flags, self.ranks)
         if any_bad:
-            self._not_finite(recent)
+            stop_for(broken_step(bad_step, recent, self.ranks.rank), self.folder, self.ranks)
 
     def _spent(self) -> bool:
         budget = self.recipe.budget
         return budget is not None and time.monotonic() - self._began > budget_seconds(budget)
 
-    def _not_finite(self, recent: list[tuple[int, Any, Any]]) -> None:
-        culprits = [(step, triples) for step, triples, loss in recent if not bool(torch.isfinite(loss))]
-        step, triples = culprits[0] if culprits else recent[0][:2]
-        elsewhere = "on another rank" if self.ranks.count > 1 else "in the gradient only"
-        where = f"this rank's triples were {np.concatenate(triples).tolist()}" if culprits else elsewhere
-        raise TrainingError(
-            f"loss or gradient is not finite at step {step} ({where}). Nothing was learned from it. "
-            "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip",
-            secondary=not culprits,
-        )
-
     def _log(self, values: dict[str, Any], probing: bool) -> None:
         shared = mean_over_ranks(values, self.ranks)
+        decided = decided_by_first(self.ranks, lambda: self._measure_and_write(shared, probing))
+        if decided is not None:
+            self.verdict, self.finished = decided
+
+    def _measure_and_write(self, shared: dict[str, float], probing: bool) -> tuple[Verdict, bool] | None:
+        """Rank 0's part; the verdict if it was time for one."""
+        assert self.probe is not None and self.journal is not None
         measured: dict[str, float] = {}
-        if self.probe and probing:
+        if probing:
             with self.learner.evaluated():
                 measured = self.probe.measure(self.learner.network)
-        if probing:
-            self.verdict, self.finished = decided_by_first(self.ranks, lambda: self._judge(measured))
-        if self.journal:
-            self.journal.write(self.done, shared | measured | self.meter.read())
-            self._say(shared | measured)
+        self.journal.write(self.done, shared | measured | self.meter.read())
+        self._say(shared | measured)
+        return self._judge(self.probe, measured) if probing else None
 
     def _say(self, row: dict[str, float]) -> None:
         """For launchers that show nothing themselves; at intervals."""
@@ -217,72 +242,60 @@ class _Trainer:
             log.info("%s", self.progress.line())
             self._said = time.monotonic()
 
-    def _judge(self, measured: dict[str, float]) -> tuple[Verdict, bool]:
-        assert self.probe is not None
-        verdict = self.verdict.after(self.probe.decisive(measured))
+    def _judge(self, probe: Probe, measured: dict[str, float]) -> tuple[Verdict, bool]:
+        verdict = self.verdict.after(probe.decisive(measured))
         return verdict, verdict.gives_up(self.recipe.early_stopping)
 
     def _draw(self, probe: Probe) -> None:
-        with self.learner.evaluated():
-            probe.draw(self.learner.network, snapshot_path(self.folder, self.done), title=f"step {self.done:,}")
+        """A picture that cannot be drawn or written ends no training."""
+        try:
+            with self.learner.evaluated():
+                probe.draw(self.learner.network, snapshot_path(self.folder, self.done), title=f"step {self.done:,}")
+        except Exception as error:
+            log.warning("no picture of step %s: %s: %s", self.done, type(error).__name__, error)
 
     def _save(self, *, best: bool) -> None:
         """Rank 0 writes, all wait, and a failure to write stops every rank."""
-        failure: DsffnetError | None = None
-        if self.journal:
-            self.journal.sync()
         random = random_states(self.ranks.count)
-        if self.is_writer:
-            try:
-                save_checkpoint(
-                    self.folder,
-                    about={
-                        "step": self.done,
-                        "finished": self.finished or self.done == self.last_step,
-                        "recipe": self.recipe.model_dump(mode="json"),
-                        "dataset": self.dataset.uuid,
-                        "dataset_sha256": self.dataset.attributes["manifest_sha256"],
-                    },
-                    weights=self.learner.network.state_dict(),
-                    average=self.learner.average.weights if self.learner.average else None,
-                    state=self.learner.state() | {"verdict": self.verdict.state(), "random": random},
-                    keep=self.recipe.keep_checkpoints,
-                    best=best,
-                )
-            except DsffnetError as error:
-                failure = error
-        if any_rank([failure is not None], self.ranks)[0]:
-            raise failure or TrainingError("rank 0 could not write a checkpoint", secondary=True)
 
-    def _newest(self) -> str | None:
-        found = load_checkpoint(self.folder)
-        return str(found.path) if found else None
+        def write() -> None:
+            if self.journal:
+                self.journal.sync()
+                self._write(random, best=best)
 
-    def _resume(self) -> None:
-        """Go on from the newest checkpoint. Rank 0 chooses it, so that all ranks start from the same one."""
-        path = decided_by_first(self.ranks, self._newest)
-        if path is None:
-            return
-        found = read_checkpoint(Path(path))
-        if found.dataset != self.dataset.uuid:
-            raise CheckpointError(
-                f"{self.folder} was trained on dataset {found.dataset}, not on {self.dataset.url} "
-                f"({self.dataset.uuid}). Choose another --out (begin there from these weights with --set "
-                f"training.start_from={self.folder}), or add --fresh to start over"
-            )
-        self.recipe.require_same_learning(TrainingRecipe.model_validate(found.recipe), where=str(self.folder))
-        state = found.state()
+        agreed(self.ranks, write, what="write a checkpoint")
+
+    def _write(self, random: list[dict[str, torch.Tensor]], *, best: bool) -> None:
+        save_checkpoint(
+            self.folder,
+            about={
+                "step": self.done,
+                "last_step": self.last_step,
+                "finished": self.finished or self.done == self.last_step,
+                "recipe": self.recipe.model_dump(mode="json"),
+                "dataset": self.dataset.uuid,
+                "dataset_sha256": self.dataset.attributes["manifest_sha256"],
+            },
+            weights=self.learner.network.state_dict(),
+            average=self.learner.average.weights if self.learner.average else None,
+            state=self.learner.state() | {"verdict": self.verdict.state(), "random": random},
+            keep=self.recipe.keep_checkpoints,
+            best=best,
+        )
+
+    def _go_on_from(self, found: Checkpoint) -> None:
+        state = state_of(found, averaged=self.recipe.average is not None)
         self.learner.load(found, state)
         restore_random_state(state["random"], self.ranks.rank)
-        self.done, self.finished, self.verdict = found.step, found.finished, Verdict(**state["verdict"])
+        self.done, self.finished = found.step, found.finished
+        self.verdict = Verdict.resumed(state["verdict"], triples=self.recipe.evaluate_triples)
 
     def _stopped_early(self) -> None:
         where = f"at step {self.done} of {self.last_step}"
+        kept = "a checkpoint was written" if self.done else "before anything was learned"
         if self.out_of_time and not self.stopping:
             raise BudgetSpent(
-                f"the time budget of {self.recipe.budget} is spent {where}; a checkpoint was written. "
+                f"the time budget of {self.recipe.budget} is spent {where}; {kept}. "
                 "Run the same command again to go on from here"
             )
-        raise TrainingStopped(
-            f"stopped {where} as told; a checkpoint was written. Run the same command again to go on from here"
-        )
+        raise TrainingStopped(f"stopped {where} as told; {kept}. Run the same command again to go on from here")

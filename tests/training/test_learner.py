@@ -1,7 +1,10 @@
 """One step means the same however it is cut: over ranks, over parts, over interruptions, over vertex counts."""
 
+import contextlib
+import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -9,7 +12,7 @@ import torch
 from datagen.generate import generate
 from tests.support.ranks import finish, start_ranks
 from tests.support.recipes import tiny_dataset, tiny_training
-from training import trainer
+from training import learner, trainer
 from training.checkpoint import CheckpointError, require_checkpoint
 from training.journal import read_journal
 from training.ranks import BudgetSpent, TrainingError
@@ -27,9 +30,26 @@ def same_bits(first: Path, second: Path, *, average: bool = False) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-6), ("float32", 1e-4)])
-def test_one_rank_equals_two_ranks_equals_parts(dataset: str, tmp_path: Path, precision: str, tolerance: float) -> None:
-    given = {**TWENTY, "precision": precision, "average": 0.9}
+NETWORKS: dict[str, dict[str, Any]] = {
+    "dsffnet": {"name": "dsffnet", "encoder_widths": (8, 8, 8), "decoder_widths": (8, 8, 8)},
+    "npt": {"name": "npt", "encoder_widths": (8, 8, 13)},
+    "corenet3d": {"name": "corenet3d", "feature_widths": (8, 8, 16), "generator_widths": (16, 16, 8)},
+}
+
+
+@pytest.mark.parametrize(
+    ("network", "precision", "tolerance"),
+    [
+        ("dsffnet", "float64", 1e-6),
+        ("dsffnet", "float32", 1e-4),
+        ("npt", "float64", 1e-6),
+        ("corenet3d", "float64", 1e-6),
+    ],
+)
+def test_one_rank_equals_two_ranks_equals_parts(
+    dataset: str, tmp_path: Path, network: str, precision: str, tolerance: float
+) -> None:
+    given = {**TWENTY, "precision": precision, "average": 0.9, "network": NETWORKS[network]}
     train(tiny_training(**given), data=dataset, run=tmp_path / "one")
     train(tiny_training(**given, accumulate=2), data=dataset, run=tmp_path / "parts")
     two = tiny_training(**given, launcher="ray", ranks=2, accumulate=2)
@@ -47,6 +67,39 @@ def test_three_ranks_share_a_batch_of_four_unequally(dataset: str, tmp_path: Pat
     results = finish(start_ranks(three, data=dataset, run=tmp_path / "three", count=3))
     assert [status for status, _ in results] == [0, 0, 0], results
     assert torch.allclose(losses(tmp_path / "three"), losses(tmp_path / "one"), rtol=1e-6, atol=0)
+
+
+def test_a_spectral_norm_iterates_once_a_step_and_a_single_part_is_as_without(
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = {"network": NETWORKS["corenet3d"]}
+    train(tiny_training(**given), data=dataset, run=tmp_path / "once")
+    monkeypatch.setattr(learner, "iterated_once", lambda network: contextlib.nullcontext())
+    train(tiny_training(**given), data=dataset, run=tmp_path / "by itself")
+    assert same_bits(tmp_path / "once", tmp_path / "by itself")
+
+
+def test_a_run_of_one_rank_goes_on_with_two(dataset: str, tmp_path: Path) -> None:
+    given = {**TWENTY, "checkpoint_every": 10, "precision": "float64", "average": 0.9}
+    train(tiny_training(**given), data=dataset, run=tmp_path / "whole")
+    shutil.copytree(tmp_path / "whole", tmp_path / "moved")
+    shutil.rmtree(tmp_path / "moved" / "checkpoints" / "step-00000020")
+    lines = (tmp_path / "moved" / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "moved" / "metrics.jsonl").write_text("".join(lines[:10]))
+    two = tiny_training(**given, launcher="ray", ranks=2)
+    results = finish(start_ranks(two, data=dataset, run=tmp_path / "moved", count=2))
+    assert [status for status, _ in results] == [0, 0], results
+    assert len(losses(tmp_path / "moved")) == 20
+    assert torch.allclose(losses(tmp_path / "moved"), losses(tmp_path / "whole"), rtol=1e-6, atol=0)
+
+
+def test_augmented_training_resumes_to_the_bit(dataset: str, tmp_path: Path) -> None:
+    recipe = tiny_training(augmentation={"vertices": 0.7, "source_noise": 0.01})
+    train(recipe, data=dataset, run=tmp_path / "whole")
+    shutil.copytree(tmp_path / "whole", tmp_path / "stopped")
+    shutil.rmtree(tmp_path / "stopped" / "checkpoints" / "step-00000008")
+    train(recipe, data=dataset, run=tmp_path / "stopped")
+    assert same_bits(tmp_path / "stopped", tmp_path / "whole")
 
 
 def test_averaged_weights_resume_to_the_bit_and_are_what_is_evaluated(dataset: str, tmp_path: Path) -> None:
@@ -115,6 +168,28 @@ def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
     assert len(saved) == (6 if every == 1 else 8)
     before, after = saved[6], last[-1].network.state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
+    kept = json.loads((tmp_path / "run" / "not-finite.json").read_text())
+    assert (kept["step"], kept["what"], len(kept["ranks"][0]["triples"])) == (6, "loss", 4)
+
+
+def test_a_gradient_alone_that_is_not_finite_names_its_step(
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(trainer._CHECK_EVERY, "cpu", 8)
+    real, calls = torch.nn.utils.clip_grad_norm_, []
+
+    def spoiled(*arguments: Any) -> torch.Tensor:
+        calls.append(1)
+        return real(*arguments) * (float("inf") if len(calls) == 5 else 1)
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoiled)
+    recipe = tiny_training(steps=40, log_every=40, evaluate_every=40, checkpoint_every=40)
+    with pytest.raises(
+        TrainingError, match=r"step 5 \(in the gradient only; this rank's triples were \[\[.*not-finite"
+    ):
+        train(recipe, data=dataset, run=tmp_path / "run")
+    kept = json.loads((tmp_path / "run" / "not-finite.json").read_text())
+    assert (kept["step"], kept["what"], kept["ranks"][0]["rank"]) == (5, "gradient", 0)
 
 
 def test_fine_tuning_begins_from_a_run_on_any_dataset(dataset: str, tmp_path: Path) -> None:

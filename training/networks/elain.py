@@ -5,11 +5,14 @@ Shapes: ``b`` meshes, ``n`` vertices, ``c`` channels, ``k`` channels of the iden
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
+from torch.nn.utils.parametrize import ParametrizationList
 
 from training.networks.modulation import full_precision
 
@@ -113,9 +116,9 @@ class ElaINBlock(nn.Module):
     """``shortcut(f(ElaIN(h))) + linear1(f(ElaIN(linear0(f(ElaIN(h))))))`` with ``f`` a LeakyReLU.
 
     The three linear maps are divided by their largest singular value (spectral norm), estimated by one power iteration
-    a forward pass in training; in evaluation the estimate stays as it is. The released code's older function updates
-    the two singular vectors in the other order, which is the same once they have settled. The shortcut is
-    learned although the channels do not change, and has no bias (released code).
+    a forward pass in training, or a step (`iterated_once`); in evaluation the estimate stays as it is. The released
+    code's older function updates the two singular vectors in the other order, which is the same once they have
+    settled. The shortcut is learned although the channels do not change, and has no bias (released code).
     """
 
     def __init__(self, channels: int, identity: int) -> None:
@@ -148,6 +151,28 @@ class ElaINBlock(nn.Module):
             weight_skipped = following.weight @ cast(Tensor, self.shortcut.weight)
             bias = following.weight @ cast(Tensor, self.linear1.bias) + following.bias
         return nn.functional.linear(inner, weight) + nn.functional.linear(skipped, weight_skipped), bias
+
+
+@contextmanager
+def iterated_once(network: nn.Module) -> Iterator[None]:
+    """Iterate every spectral norm of a network once, then never while the block runs: for the parts of one step.
+
+    By itself a spectral norm iterates in every forward pass, so that the weights would differ from part to part, and
+    the step with the number of parts. With a single part the numbers are the same to the bit.
+    """
+    norms = [module for module in network.modules() if hasattr(module, "_power_method")]
+    holders = [module for module in network.modules() if isinstance(module, ParametrizationList)]
+    with torch.no_grad():
+        for holder in holders:
+            if any(norm in norms for norm in holder):
+                holder()
+    for norm in norms:
+        norm.eval()
+    try:
+        yield
+    finally:
+        for norm in norms:
+            norm.train()
 
 
 class Generator(nn.Module):
