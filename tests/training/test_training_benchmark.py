@@ -5,7 +5,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
+from benchmarks.training import QUICKSTART, rate, recipe_of
+
+
+def test_a_rank_that_fails_is_told_with_its_reason(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match=r"rank 0 ended with 1: [^$]*nothing\.zarr"):
+        rate(recipe_of(QUICKSTART, 4), tmp_path / "nothing.zarr", tmp_path / "run", ranks=1, threads=1)
+
+
+@pytest.mark.slow  # five processes that import torch
 def test_the_benchmark_of_ranks_against_threads_runs() -> None:
     command = [sys.executable, "-m", "benchmarks.training", "--quick"]
     done = subprocess.run(
