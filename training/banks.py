@@ -10,22 +10,22 @@ A batch is the same to the bit from any place. ``device``: a GPU's memory, where
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datagen.errors import DatasetError
+from datagen.errors import DatasetError, StorageError
 from datagen.store import Dataset
 from training.batches import Batch, EdgeSum, EdgeTable, counts_of
+from training.held import HeldMeshes, Meshes
 from training.layout import Floats, Layout, decode
 from training.lookahead import Lookahead, Share
 from training.mapped import Log, map_vertices, mapped_path
-from training.room import Cache, Choice, choose, default_folder, gigabytes, memory_room
+from training.room import Cache, Choice, Place, choose, default_folder, gigabytes, memory_room
 from training.streaming import StreamedMeshes
 from training.triples import Triples
 
@@ -34,45 +34,6 @@ _TOGETHER_BYTES = (
 )  # of meshes that a streamed bank asks for at a time; batches of three times as many may be ready
 _STREAM_SHARE = 0.25  # of the free memory, for a streamed bank
 _LOGGER = logging.getLogger(__name__)
-
-
-class Meshes(Protocol):
-    """Where vertices are."""
-
-    def gather(self, meshes: NDArray[np.int64]) -> Tensor:
-        """Vertices [mesh, vertex, 3] of some meshes, padded with zeros to the largest of them."""
-
-    def fetch(self, meshes: NDArray[np.int64]) -> None:
-        """Make ready what will be gathered soon."""
-
-    def close(self) -> None:
-        """Give back what is held beside memory."""
-
-
-class HeldMeshes:
-    """All vertices [vertex, 3] of a layout in one tensor: on a device, in memory, or mapped."""
-
-    def __init__(self, layout: Layout, vertices: Tensor) -> None:
-        self._vertices, self._layout, self._count = vertices, layout, layout.count
-
-    def gather(self, meshes: NDArray[np.int64]) -> Tensor:
-        """See :class:`Meshes`."""
-        numbers = torch.from_numpy(meshes).to(self._vertices.device)
-        if self._count is not None:
-            return self._vertices.view(-1, self._count, 3).index_select(0, numbers)
-        counts, starts = self._layout.counts[meshes], self._layout.starts[meshes]
-        counts_there, starts_there = torch.from_numpy(np.stack([counts, starts])[..., None]).to(numbers.device)
-        places = torch.arange(int(counts.max()), device=numbers.device)
-        inside = places < counts_there
-        rows = starts_there + torch.where(inside, places, 0)
-        found = self._vertices.index_select(0, rows.flatten()).view(*rows.shape, 3)
-        return found.masked_fill_(~inside[..., None], 0)
-
-    def fetch(self, meshes: NDArray[np.int64]) -> None:
-        """See :class:`Meshes`; all are there."""
-
-    def close(self) -> None:
-        """See :class:`Meshes`."""
 
 
 class Bank:
@@ -161,8 +122,8 @@ class Bank:
 
     def _assemble(self, triples: Triples) -> Batch:
         source_meshes, target_meshes = self._numbers(triples)
-        source = self._meshes.gather(source_meshes)
-        target, truth = self._meshes.gather(target_meshes).chunk(2)
+        source, both = self._meshes.gather(source_meshes, target_meshes)
+        target, truth = both.chunk(2)
         edges = self._edges.of(triples[:, 2], rows=target.shape[1])
         counts = self._layout.counts
         source_counts, target_counts = counts_of(counts[source_meshes]), counts_of(counts[target_meshes])
@@ -212,23 +173,37 @@ def open_bank(
     RecipeError
         ``cache`` names a place that has no room.
     StorageError
-        The file to be mapped cannot be written.
+        ``cache`` is ``mapped`` and the file cannot be written; ``auto`` streams then.
     """
     if not len(identities):
         raise DatasetError(f"{dataset.url} has no such identities: there is nothing to train on")
-    device, folder = torch.device(device), Path(folder) if folder else default_folder()
-    layout = Layout(dataset, identities)
-    there = mapped_path(layout, folder).exists()
-    choice = choose(cache, layout.bytes, device=device, folder=folder, already_mapped=there, sharers=sharers)
+    device, layout = torch.device(device), Layout(dataset, identities)
     edges = EdgeTable(dataset, identities, device=device, of=edge_sum)
-    if choice.place == "stream":
-        memory = int(_STREAM_SHARE * memory_room().free / sharers)
-        return streamed_bank(layout, edges, device=device, memory=memory, why=choice.why)
-    if choice.place == "mapped":
-        held = map_vertices(layout, folder, log=log)
-    else:
-        held = _decoded(layout, device if choice.place == "device" else torch.device("cpu"), sharers=sharers)
-    return Bank(layout, HeldMeshes(layout, held), edges, choice, device=device)
+
+    def mapped() -> Path:
+        return mapped_path(layout, Path(folder) if folder else default_folder())
+
+    choice = choose(cache, layout.bytes, device=device, mapped=mapped, sharers=sharers)
+    try:
+        if choice.place != "stream":
+            held = _held(layout, choice.place, device, mapped, sharers=sharers, log=log)
+            return Bank(layout, HeldMeshes(layout, held), edges, choice, device=device)
+    except StorageError as error:
+        if cache != "auto":
+            raise
+        log(f"training meshes are streamed, not mapped: {error}")
+        choice = Choice("stream", f"streamed, {gigabytes(layout.bytes)} in all: {mapped().parent} cannot be written")
+    memory = int(_STREAM_SHARE * memory_room().free / sharers)
+    return streamed_bank(layout, edges, device=device, memory=memory, why=choice.why)
+
+
+def _held(
+    layout: Layout, place: Place, device: torch.device, mapped: Callable[[], Path], *, sharers: int, log: Log
+) -> Tensor:
+    """All vertices [vertex, 3] of a layout, in the place that was chosen for them."""
+    if place == "mapped":
+        return map_vertices(layout, mapped().parent, log=log)
+    return _decoded(layout, device if place == "device" else torch.device("cpu"), sharers=sharers)
 
 
 def streamed_bank(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from datagen.errors import DatasetError
 from datagen.store import Dataset
+from training.incidence import INCIDENCES, incidence_of, join_incidences
 from training.layout import normalised
 from training.losses import loss_edges
 from training.triples import Triples
@@ -106,12 +107,14 @@ class EdgeTable:
     ) -> None:
         self._topology: dict[int, int] = {}
         self._edges: list[Tensor] = []
+        self._counts: list[int] = []
         known: dict[bytes, int] = {}
         for identity in identities:
             faces = dataset.faces(identity)
             number = known.setdefault(faces.tobytes(), len(known))
             if number == len(self._edges):
                 self._edges.append(torch.from_numpy(loss_edges(faces, of)).to(device))
+                self._counts.append(dataset.vertex_count(identity))
             self._topology[int(identity)] = number
 
     def of(self, identities: NDArray[np.integer], *, rows: int) -> Tensor | PackedEdges:
@@ -119,10 +122,19 @@ class EdgeTable:
         numbers = [self._topology[int(identity)] for identity in identities]
         if len(set(numbers)) == 1:
             return self._edges[numbers[0]]
-        edges = [self._edges[number] for number in numbers]
-        sizes = torch.tensor([len(its) for its in edges], device=edges[0].device)
-        meshes = torch.repeat_interleave(torch.arange(len(edges), device=sizes.device), sizes)
-        return PackedEdges(torch.cat(edges) + rows * meshes[:, None], meshes)
+        return _packed([self._edges[number] for number in numbers], [self._counts[number] for number in numbers], rows)
+
+
+def _packed(edges: Sequence[Tensor], counts: Sequence[int], rows: int) -> PackedEdges:
+    """Edges [e, 2] of meshes of so many vertices, each padded to ``rows``; nothing waits for a GPU.
+
+    How they touch is put together from what is known of each topology: sorting a batch's edges anew would take longer.
+    """
+    pairs = torch.cat([its + rows * mesh for mesh, its in enumerate(edges)])
+    meshes = torch.cat([torch.full_like(its[:, 0], mesh) for mesh, its in enumerate(edges)])
+    parts = [incidence_of(its, count) for its, count in zip(edges, counts, strict=True)]
+    INCIDENCES[pairs] = join_incidences(pairs, parts, rows)
+    return PackedEdges(pairs, meshes)
 
 
 def counts_of(counts: NDArray[np.integer]) -> Counts | None:

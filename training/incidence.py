@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import MutableMapping, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
+from torch.nn.functional import embedding_bag, pad
 from torch.utils.weak import WeakTensorKeyDictionary
 
 
@@ -41,10 +42,37 @@ def make_incidence(pairs: Tensor, vertices: int) -> Incidence:
     at, order = torch.sort(pairs.t().reshape(-1), stable=True)
     return Incidence(
         ends=pairs,
-        end_signs=torch.tensor([1.0, -1.0], device=pairs.device).repeat(len(pairs), 1),
+        end_signs=1.0 - 2.0 * torch.arange(2, device=pairs.device).repeat(len(pairs), 1),
         edges=order % len(pairs),
         signs=torch.where(order < len(pairs), 1.0, -1.0),
         starts=torch.searchsorted(at, torch.arange(vertices, device=pairs.device)),
+    )
+
+
+def join_incidences(pairs: Tensor, parts: Sequence[Incidence], rows: int) -> Incidence:
+    """Return the incidence of packed edges from those of their meshes, without sorting.
+
+    Parameters
+    ----------
+    pairs
+        ``[e, 2]`` int64, the edges of mesh after mesh, those of mesh `m` shifted by ``m * rows``.
+    parts
+        The incidence of each mesh, of at most `rows` vertices.
+    rows
+        To which the vertices of each mesh are padded.
+    """
+    sizes = [len(part.ends) for part in parts]
+    before = [0, *accumulate(sizes)]
+    shifted = list(zip(parts, before[:-1], strict=True))
+    ends = zip(shifted, before[1:], strict=True)  # padding has no edges: it begins where the next mesh does
+    return Incidence(
+        ends=pairs.detach(),
+        end_signs=torch.cat([part.end_signs for part in parts]),
+        edges=torch.cat([part.edges + first for part, first in shifted]),
+        signs=torch.cat([part.signs for part in parts]),
+        starts=torch.cat(
+            [pad(part.starts + 2 * first, (0, rows - len(part.starts)), value=2 * end) for (part, first), end in ends]
+        ),
     )
 
 

@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import mse_loss
 
 from training.incidence import edge_vectors, incidence_of, sum_at_vertices
+from training.sending import sent
 
 EDGE_WEIGHT = 0.0005
 """Weight of the edge-length loss (DSFFNet, section 4.1)."""
@@ -142,7 +143,7 @@ def reconstruction_loss(prediction: Tensor, truth: Tensor, counts: Sequence[int]
         return mse_loss(prediction, truth) * 3
     if len(counts) != meshes or min(counts) < 1 or max(counts) > rows:
         raise ValueError(f"counts must be {meshes} numbers from 1 to {rows}, got {list(counts)}")
-    vertices = torch.tensor(counts, device=prediction.device)
+    vertices = sent(torch.tensor(counts), prediction.device)
     present = torch.arange(rows, device=prediction.device) < vertices.unsqueeze(1)
     # chosen before it is squared: a product with zero would keep the padding's NaN, in the gradient too
     difference = torch.where(present.unsqueeze(2), prediction - truth, 0)

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +28,7 @@ from training.room import gigabytes
 FORMAT = 1
 """Of the file (with its chunks, :meth:`Layout.chunks`) and of how vertices are normalised: another is another file."""
 _HEAD = 4096
-_PATIENCE = 10.0  # seconds until a person is told that another process is at it
+_PATIENCE = 10.0  # seconds until a person is told what takes so long
 
 Log = Callable[[str], None]
 
@@ -62,16 +63,35 @@ def map_vertices(layout: Layout, folder: Path, *, log: Log) -> Tensor:
         A shard of the dataset is missing or damaged.
     """
     path = mapped_path(layout, folder)
-    fault = _fault(path, layout)
-    if fault:
-        with _locked(path, log=log):
-            fault = _fault(path, layout)
-            if fault and path.exists():
-                log(f"{path} is not what was written ({fault}): made again from {layout.dataset.url}")
-            if fault:
-                _write(path, layout)
+    sound = False
+    while not sound:
+        looks, fault = _looks(path), _fault(path, layout, log=log)
+        sound = fault is None or _made(path, layout, looks, fault, log=log)
     mapped = np.memmap(path, "<f4", mode="c", offset=_HEAD, shape=(layout.vertices, 3))
     return torch.from_numpy(mapped)
+
+
+def _made(path: Path, layout: Layout, looks: tuple[int, ...] | None, fault: str, *, log: Log) -> bool:
+    """Write a file in the place of a faulty one; False if another process has done so since that ``looks`` were taken.
+
+    What another has written is to be checked after the lock is released, so that many processes can at once.
+    """
+    with _locked(path, log=log):
+        if _looks(path) != looks:
+            return False
+        if looks:
+            log(f"{path} is not what was written ({fault}): made again from {layout.dataset.url}")
+        _write(path, layout)
+    return True
+
+
+def _looks(path: Path) -> tuple[int, ...] | None:
+    """What differs between two files that had the same name; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 @contextmanager
@@ -91,7 +111,7 @@ def _locked(path: Path, *, log: Log) -> Iterator[None]:
         lock.release()
 
 
-def _fault(path: Path, layout: Layout) -> str | None:
+def _fault(path: Path, layout: Layout, *, log: Log) -> str | None:
     """What is wrong with a file; None if it is the layout's and every bit is as it was written."""
     sizes = [12 * int(layout.counts[meshes].sum()) for meshes in layout.chunks()]
     try:
@@ -101,11 +121,21 @@ def _fault(path: Path, layout: Layout) -> str | None:
                 return f"{found_size} bytes instead of {right}"
             if file.read(_HEAD) != _head(layout):
                 return "its first page is another's"
-            found = [google_crc32c.value(file.read(size)) for size in sizes]
+            found = [google_crc32c.value(file.read(size)) for size in _telling(sizes, path, log)]
             stated = np.frombuffer(file.read(), "<u4").tolist()
     except OSError as error:
         return error.strerror or str(error)
     return None if found == stated else "a checksum does not fit"
+
+
+def _telling(sizes: list[int], path: Path, log: Log) -> Iterator[int]:
+    """The same sizes; a person is told once if going through them takes long."""
+    began, told = time.monotonic(), False
+    for size in sizes:
+        if not told and time.monotonic() - began > _PATIENCE:
+            log(f"checking {path} ({gigabytes(sum(sizes))}) against its checksums before it is used")
+            told = True
+        yield size
 
 
 def _write(path: Path, layout: Layout) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,21 +74,27 @@ def _container_room(cgroup: Path = _CGROUP) -> int:
 
 def disk_room(folder: Path) -> Room:
     """Free space of the disk on which a folder lies or will lie."""
-    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    whole = folder.absolute()
+    there = next(place for place in (whole, *whole.parents) if os.path.exists(place))  # Path's raises if not permitted
     return Room(f"disk of {folder}", shutil.disk_usage(there).free, _DISK_SHARE)
 
 
 def default_folder() -> Path:
-    """Where memory-mapped files are kept: below DSFFNET_CACHE, or dsffnet in the user's cache folder."""
-    given = os.environ.get("DSFFNET_CACHE")
-    cache = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dsffnet"
-    return cache / "vertices"
+    """Where memory-mapped files are kept: below DSFFNET_CACHE, or dsffnet in the user's cache folder.
+
+    A user without a home, as containers have them, has a folder among the temporary ones.
+    """
+    for name, below in (("DSFFNET_CACHE", "vertices"), ("XDG_CACHE_HOME", "dsffnet/vertices")):
+        if given := os.environ.get(name):
+            return Path(given) / below
+    try:
+        return Path.home() / ".cache/dsffnet/vertices"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"dsffnet-{os.getuid()}" / "vertices"
 
 
-def choose(
-    cache: Cache, size: int, *, device: torch.device, folder: Path, already_mapped: bool, sharers: int = 1
-) -> Choice:
-    """Where to keep ``size`` bytes of meshes.
+def choose(cache: Cache, size: int, *, device: torch.device, mapped: Callable[[], Path], sharers: int = 1) -> Choice:
+    """Where to keep ``size`` bytes of meshes; ``mapped`` gives the path of the memory-mapped file, if it is asked for.
 
     ``auto`` is the first of device memory (on a GPU), memory, and a memory-mapped file that has room, else streaming.
     Memory must have it once for each of the ``sharers`` processes of this machine; a mapped file they share.
@@ -97,18 +104,18 @@ def choose(
     RecipeError
         A place was asked for that has not so many bytes free.
     """
-    candidates: list[tuple[Place, int, Callable[[], Room]]] = [
-        ("memory", size * sharers, memory_room),
-        ("mapped", 0 if already_mapped else size, lambda: disk_room(folder)),
+    candidates: list[tuple[Place, Callable[[], tuple[int, Room]]]] = [
+        ("memory", lambda: (size * sharers, memory_room())),
+        ("mapped", lambda: (0 if os.path.exists(mapped()) else size, disk_room(mapped().parent))),
     ]
     if device.type == "cuda":
-        candidates.insert(0, ("device", size, lambda: device_room(device)))
+        candidates.insert(0, ("device", lambda: (size, device_room(device))))
     if cache == "device" and device.type != "cuda":
         cache = "memory"
     tried = []
-    for place, needed, look in candidates:
+    for place, look in candidates:
         if cache in ("auto", place):
-            room = look()
+            needed, room = look()
             if room.holds(needed) or (cache == place and needed <= room.free):
                 return Choice(place, _why(place, size, needed, room))
             tried.append(f"{gigabytes(needed)} are too much for the {room.where} ({gigabytes(room.free)} free)")

@@ -87,8 +87,11 @@ class StreamedMeshes:
             self._held[slot, len(vertices) :] = 0
             self._slot[mesh] = slot
 
-    def gather(self, meshes: NDArray[np.int64]) -> Tensor:
-        """Vertices [mesh, vertex, 3], padded with zeros to the largest of them."""
+    def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
+        """Vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to the largest of the group."""
+        return [self._gathered(group) for group in groups]
+
+    def _gathered(self, meshes: NDArray[np.int64]) -> Tensor:
         with self._guard:
             self.fetch(meshes)
             slots = torch.tensor([self._slot[int(mesh)] for mesh in meshes])

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -29,6 +30,7 @@ from training.banks import Bank, open_bank, streamed_bank
 from training.batches import Batch, EdgeTable
 from training.layout import Layout
 from training.lookahead import Share
+from training.losses import transfer_loss
 from training.room import Room, choose
 from training.triples import TripleOrder
 
@@ -107,6 +109,26 @@ def test_a_gpu_gets_the_same_bits_from_every_cache(legs: Dataset, folder: Path) 
         there = [(share, [batch.to("cpu") for batch in batches]) for share, batches in found]
         assert equal_steps(there, expected), bank.where
         bank.close()
+
+
+@pytest.mark.gpu
+def test_a_gpu_that_holds_the_meshes_is_not_waited_for(legs: Dataset) -> None:
+    """torch raises where the processor would wait for the GPU, in the batch and in both losses."""
+    bank = training_bank(legs, "device", device="cuda")
+    order = TripleOrder(legs.identities("training"), range(60), batch=12, seed=5)
+    shares = list(islice(order.batches(first_step=0), 3))
+    for step, (triples,) in enumerate(shares):  # the first works out how each topology's edges touch
+        torch.cuda.set_sync_debug_mode("error" if step else "default")
+        try:
+            batch = bank.batch(triples)
+            prediction = batch.target.clone().requires_grad_()
+            loss, _ = transfer_loss(
+                prediction, truth=batch.truth, target=batch.target, edges=batch.edges, counts=batch.target_counts
+            )
+            loss.backward()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    bank.close()
 
 
 def test_a_streamed_bank_holds_no_more_than_it_may(legs: Dataset) -> None:
@@ -246,6 +268,49 @@ class TestMapped:
         with pytest.raises(StorageError, match=r"could not write the cache .*Not a directory"):
             training_bank(open_dataset(dataset), "mapped", folder=tmp_path / "file" / "below")
 
+    def test_auto_streams_where_the_file_cannot_be_written_and_says_so(
+        self, dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        opened, said = open_dataset(dataset), []
+        expected = steps(training_bank(opened), opened, count=3)
+        monkeypatch.setattr(room, "memory_room", lambda: Room("memory", 1, 0.5))
+        (tmp_path / "file").write_text("")
+        bank = training_bank(opened, "auto", folder=tmp_path / "file" / "below", log=said.append)
+        assert bank.place == "stream" and "below cannot be written" in bank.where
+        assert len(said) == 1 and "streamed, not mapped: could not write the cache" in said[0]
+        assert equal_steps(steps(bank, opened, count=3), expected)
+        bank.close()
+
+    def test_those_who_waited_check_the_file_at_the_same_time(
+        self, dataset: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Three checks of what another process wrote meet: under the lock each would wait for the one before it."""
+        together, check = threading.Barrier(3), mapped._fault
+        opened = open_dataset(dataset)
+        layout = Layout(opened, opened.identities("training"))
+        path = mapped.mapped_path(layout, folder)
+
+        def checked(at: Path, its: Layout, *, log: Any) -> str | None:
+            if at.exists():
+                together.wait(20)
+            return check(at, its, log=log)
+
+        monkeypatch.setattr(mapped, "_fault", checked)
+        with ThreadPoolExecutor(3) as pool, mapped._locked(path, log=print):
+            waiting = [pool.submit(mapped.map_vertices, layout, folder, log=print) for _ in range(3)]
+            time.sleep(0.3)  # all have seen that there is no file
+            mapped._write(path, layout)
+        assert all(torch.equal(each.result(), waiting[0].result()) for each in waiting)
+
+    def test_a_person_is_told_of_a_long_check(
+        self, dataset: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        opened, said = open_dataset(dataset), []
+        training_bank(opened, "mapped", log=said.append)
+        monkeypatch.setattr(mapped, "_PATIENCE", -1)
+        training_bank(opened, "mapped", log=said.append)
+        assert len(said) == 1 and re.search(r"checking .*\.vertices \(.* kB\) against its checksums", said[0])
+
 
 class TestChoice:
     """``auto`` takes the first place with room; a place that was asked for is taken if it can be."""
@@ -262,7 +327,7 @@ class TestChoice:
         }
         for name, function in rooms.items():
             monkeypatch.setattr(room, name, function)
-        options = {"already_mapped": False, "folder": Path("/caches")} | more
+        options = {"mapped": lambda: Path("/caches/not-there.vertices")} | more
         return choose(cache, self.SIZE, device=torch.device(device), **options)
 
     @pytest.mark.parametrize(
@@ -287,9 +352,33 @@ class TestChoice:
         assert self.chosen(monkeypatch, "auto", "cpu", free, sharers=4).why.endswith("(4 processes: 4.0 GB)")
         assert self.chosen(monkeypatch, "auto", "cpu", free, sharers=8).place == "mapped"
 
-    def test_a_file_that_is_there_needs_no_room(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        free = {"memory": 1, "disk": 0}
-        assert self.chosen(monkeypatch, "auto", "cpu", free, already_mapped=True).place == "mapped"
+    def test_a_file_that_is_there_needs_no_room(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        (tmp_path / "its.vertices").touch()
+        found = self.chosen(
+            monkeypatch, "auto", "cpu", {"memory": 1, "disk": 0}, mapped=lambda: tmp_path / "its.vertices"
+        )
+        assert found.place == "mapped"
+
+    @pytest.mark.parametrize("cache", ["auto", "memory", "stream"])
+    def test_a_folder_is_looked_for_only_where_a_file_is_to_be_mapped(
+        self, monkeypatch: pytest.MonkeyPatch, cache: str
+    ) -> None:
+        def nowhere() -> Path:
+            raise RuntimeError("Could not determine home directory.")
+
+        assert self.chosen(monkeypatch, cache, "cpu", {"memory": 99, "disk": 99}, mapped=nowhere).place != "mapped"
+
+    def test_a_user_without_a_home_has_a_folder_among_the_temporary_ones(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        def nowhere() -> Path:
+            raise RuntimeError("Could not determine home directory.")
+
+        for name in ("DSFFNET_CACHE", "XDG_CACHE_HOME"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr(Path, "home", nowhere)
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+        assert room.default_folder() == tmp_path / f"dsffnet-{os.getuid()}" / "vertices"
 
     def test_device_on_a_cpu_is_memory(self, monkeypatch: pytest.MonkeyPatch) -> None:
         assert self.chosen(monkeypatch, "device", "cpu", {"memory": 10, "disk": 10}).place == "memory"

@@ -15,6 +15,7 @@ from tests.support.recipes import tiny_training
 from training.augmentation import Augmentation
 from training.banks import open_bank
 from training.batches import Batch, EdgeTable, PackedEdges, read_batch
+from training.incidence import INCIDENCES, incidence_of, make_incidence
 from training.networks.dsffnet import DSFFNet
 from training.networks.mixed_counts import MixedCounts
 from training.triples import TripleOrder
@@ -96,6 +97,19 @@ def test_packed_edges_are_each_meshs_own_edges(mixed: Dataset) -> None:
         mesh = unit(mixed, target, source_pose)
         assert torch.equal(packed[batch.edges.meshes == row], (mesh[first] - mesh[second]).norm(dim=1))
     assert (batch.edges.meshes.diff() >= 0).all()
+
+
+def test_how_packed_edges_touch_is_known_without_sorting_them(mixed: Dataset) -> None:
+    """Put together from each topology's, it is what sorting the batch's edges gives, to the order of every sum."""
+    bank = open_bank(mixed, mixed.identities("training"))
+    batches = [bank.batch(triples) for triples in (TRIPLES, TRIPLES[::-1], TRIPLES[:3])]
+    for batch in batches:
+        assert isinstance(batch.edges, PackedEdges)
+        rows = batch.target.shape[0] * batch.target.shape[1]
+        found = INCIDENCES[batch.edges.pairs]
+        assert incidence_of(batch.edges.pairs, rows) is found
+        for one, other in zip(found, make_incidence(batch.edges.pairs, rows), strict=True):
+            assert torch.equal(one, other) and one.dtype == other.dtype
 
 
 def test_edges_of_faces_have_the_mean_of_the_faces_sums(mixed: Dataset) -> None:
