@@ -8,6 +8,7 @@ from datagen.store import Dataset
 from training.checkpoint import Checkpoint, Which, require_checkpoint
 
 _WEIGHTS = ".safetensors"
+_WORDS: dict[str, Which] = {"latest": "latest", "best": "best"}
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ def evaluated(place: Path, which: Which = "latest") -> Evaluated:
 
 def which_checkpoint(word: str) -> Which:
     """``latest``, ``best`` or a step, as it comes from a command line."""
-    if word == "latest" or word == "best":
-        return word
+    if word in _WORDS:
+        return _WORDS[word]
     if word.isdecimal():
         return int(word)
     raise argparse.ArgumentTypeError(f"{word!r} is neither latest nor best nor a step such as 2000")
