@@ -85,19 +85,36 @@ def measure_chunk(
     """Rows of the triples [start, start + recipe.chunk) of one list, for one checkpoint and the no-op baselines."""
     dataset, network = open_dataset(data), _network(checkpoint)
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    batch = read_batch(dataset, triples)
-    faces = dataset.faces(int(triples[0, 2]))
+    batch = read_batch(dataset, triples, padded=True)
     outputs = {method: predict(network, batch), NO_OPS[0]: batch.target}
-    if batch.source.shape == batch.truth.shape:
+    if _one_count(dataset, evaluation_list(dataset, recipe, pose_type)):
         outputs[NO_OPS[1]] = batch.source
-    half = torch.tensor([_half_size(dataset, int(t[2]), int(t[1])) for t in triples])
     return [
         Row(name, pose_type, start + place, *map(int, triple), *values)
         for name, output in outputs.items()
         for place, (triple, values) in enumerate(
-            zip(triples, _measure(output, batch.truth, faces, half, recipe), strict=True)
+            zip(triples, _measure_each(dataset, triples, output, batch.truth, recipe), strict=True)
         )
     ]
+
+
+def _one_count(dataset: Dataset, triples: NDArray[np.integer]) -> bool:
+    """Whether all sources and targets of a list have as many vertices, so that a source can stand for an output."""
+    identities = np.unique(triples[:, [0, 2]]).tolist()
+    return len({dataset.vertex_count(identity) for identity in identities}) == 1
+
+
+def _measure_each(
+    dataset: Dataset, triples: NDArray[np.integer], output: Tensor, truth: Tensor, recipe: EvaluationRecipe
+) -> list[tuple[float, ...]]:
+    """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
+    found: dict[int, tuple[float, ...]] = {}
+    for identity in np.unique(triples[:, 2]).tolist():
+        places, count = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.vertex_count(identity)
+        half = torch.tensor([_half_size(dataset, identity, int(triples[place, 1])) for place in places])
+        ours, right = output[places, :count], truth[places, :count]
+        found |= zip(places, _measure(ours, right, dataset.faces(identity), half, recipe), strict=True)
+    return [found[place] for place in range(len(triples))]
 
 
 def _measure(

@@ -1,6 +1,7 @@
 """The same ``train`` under different launchers: in this process, or as ranks of Ray Train (torchrun needs nothing).
 
-Under torchrun: ``torchrun --nproc-per-node 2 -m training.launch RECIPE.yaml DATA.zarr RUN`` reads RANK and friends.
+Under torchrun: ``torchrun --nproc-per-node 2 -m training.launch RECIPE.yaml DATA.zarr RUN [key=value ...]`` reads RANK
+and friends.
 """
 
 import json
@@ -8,26 +9,31 @@ import logging
 import os
 import signal
 import sys
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from datagen.errors import DsffnetError, RecipeError
+from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
 from training.ranks import STOP_FILE, TrainingError, TrainingStopped
-from training.recipe import TrainingRecipe
+from training.recipe import TrainingRecipe, budget_seconds
+from training.recipe_file import recipe_in
 from training.trainer import train
 
+log = logging.getLogger(__name__)
 _RESTARTS, _FAILURE, _MARK = 3, "failure.json", ".launch"
+_ASK_SECONDS = 60.0  # that a cluster has to say whether its torch uses its GPUs
 
 
 def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
     """Train to the recipe's last step, or raise what stopped it.
 
     With the launcher ``ray``, a rank that dies takes the others down and the group starts again from the newest
-    checkpoint, a few times.
+    checkpoint: as often as it takes while there are new checkpoints, a few times where there are none. The recipe's
+    time budget counts from this call, restarts included.
 
     Raises
     ------
@@ -37,6 +43,7 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
         Whatever :func:`training.trainer.train` raises.
     """
     if recipe.launcher == "inline":
+        _say("1 rank in this process", recipe.device)
         train(recipe, data=data, run=run)
     else:
         _with_ray(recipe, data, run)
@@ -46,10 +53,12 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     from ray.train import FailureConfig, RunConfig, ScalingConfig
     from ray.train.torch import TorchConfig, TorchTrainer
 
-    gpu = _on_gpus(recipe)
+    began, gpu = time.time(), _on_gpus(recipe)
     if not gpu:
         recipe = recipe.model_copy(update={"device": "cpu"})
-    _require(recipe.fewest_ranks or recipe.ranks, "GPU" if gpu else "CPU")
+    _require(recipe, "GPU" if gpu else "CPU")
+    fewest = f"{recipe.fewest_ranks} to " if recipe.fewest_ranks else ""
+    _say(f"{fewest}{recipe.ranks} ranks by Ray", "one GPU each (NCCL)" if gpu else "CPUs (Gloo)")
     run.mkdir(parents=True, exist_ok=True)
     for left_over in (_FAILURE, STOP_FILE):
         (run / left_over).unlink(missing_ok=True)
@@ -57,7 +66,13 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     write_atomically(run / _MARK, mark.encode())
     trainer = TorchTrainer(
         _rank,
-        train_loop_config={"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark},
+        train_loop_config={
+            "recipe": recipe.model_dump(mode="json"),
+            "data": data,
+            "run": str(run),
+            "mark": mark,
+            "began": began,
+        },
         torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
         scaling_config=ScalingConfig(num_workers=_workers(recipe), use_gpu=gpu),
         run_config=RunConfig(
@@ -66,15 +81,43 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     )
     try:
         with _passing_on_sigterm(run):
-            trainer.fit()
+            _fit(trainer.fit, run)
+    except DsffnetError:
+        raise
     except Exception as error:
         raise _failure_of(run) or TrainingError(
-            f"the training ranks died {_RESTARTS + 1} times; the last reason: {str(error).strip().splitlines()[-1]}. "
+            f"the training ranks died {_RESTARTS + 1} times without a new checkpoint; the last reason: "
+            f"{(str(error).strip().splitlines() or [type(error).__name__])[-1]}. "
             "Run the same command again to go on from the newest checkpoint"
         ) from error
     failure = _failure_of(run)
     if failure:
         raise failure
+
+
+def _fit(fit: Callable[[], object], run: Path) -> None:
+    """Have Ray train, anew whenever its restarts are used up and a checkpoint came of them: a training of days may
+    lose more nodes than one that gets nowhere should be restarted.
+    """
+    while True:
+        before = _newest(run)
+        try:
+            fit()
+            return
+        except Exception as error:
+            if (run / _FAILURE).exists() or (run / STOP_FILE).exists() or _newest(run) == before:
+                raise
+            log.warning("the training ranks died %d times (%s); going on, as there is progress", _RESTARTS + 1, error)
+
+
+def _newest(run: Path) -> str:
+    """The name of the newest checkpoint's folder, "" where there is none."""
+    return max((path.name for path in (run / "checkpoints").glob("step-*")), default="")
+
+
+def _say(who: str, where: str) -> None:
+    """For the person who waits; Ray's ranks have no log that reaches the driver."""
+    print(f"train: {who}, on {where}", file=sys.stderr, flush=True)
 
 
 def _workers(recipe: TrainingRecipe) -> int | tuple[int, int]:
@@ -92,12 +135,21 @@ def _rank(config: dict[str, Any]) -> None:
     try:
         if not (run / _MARK).exists() or (run / _MARK).read_text() != config["mark"]:
             raise TrainingError(f"this rank does not see {run} as the driver does: --out must be on a disk they share")
-        train(TrainingRecipe.model_validate(config["recipe"]), data=config["data"], run=run)
+        recipe = _with_what_is_left(TrainingRecipe.model_validate(config["recipe"]), began=config["began"])
+        train(recipe, data=config["data"], run=run)
     except DsffnetError as error:
         if not (getattr(error, "secondary", False) and (run / _FAILURE).exists()):
             about = {"message": str(error), "status": error.exit_status, "stopped": isinstance(error, TrainingStopped)}
             write_atomically(run / _FAILURE, json.dumps(about).encode())
         raise
+
+
+def _with_what_is_left(recipe: TrainingRecipe, *, began: float) -> TrainingRecipe:
+    """The recipe with what is left of its time budget since ``began`` (seconds since 1970), a second at least."""
+    if recipe.budget is None:
+        return recipe
+    left = max(1.0, budget_seconds(recipe.budget) - max(0.0, time.time() - began))
+    return recipe.model_copy(update={"budget": f"{left:.0f}s"})
 
 
 def _failure_of(run: Path) -> TrainingError | None:
@@ -128,12 +180,28 @@ def _passing_on_sigterm(run: Path) -> Iterator[None]:
 
 
 def _on_gpus(recipe: TrainingRecipe) -> bool:
-    """Whether the ranks get GPUs: if asked for, or if there are enough of them and torch here can use them."""
+    """Whether the ranks get GPUs: if asked for, or if the cluster has enough of them and its torch can use them."""
+    if recipe.device != "auto":
+        return recipe.device == "cuda"
+    return _cluster("GPU") >= (recipe.fewest_ranks or recipe.ranks) and _torch_there_uses_gpus()
+
+
+def _torch_there_uses_gpus() -> bool:
+    """What torch says where a GPU is; the driver's machine may have none, or another torch."""
+    import ray
+
+    asked = ray.remote(num_gpus=1, num_cpus=0)(_sees_cuda).remote()
+    try:
+        return bool(ray.get(asked, timeout=_ASK_SECONDS))
+    except ray.exceptions.GetTimeoutError:  # all GPUs are at work; Ray Train waits for them too
+        ray.cancel(asked)
+        return True
+
+
+def _sees_cuda() -> bool:
     import torch
 
-    if recipe.device == "cuda":
-        return True
-    return recipe.device == "auto" and _cluster("GPU") >= recipe.ranks and torch.cuda.is_available()
+    return torch.cuda.is_available()
 
 
 def _cluster(resource: str) -> int:
@@ -142,48 +210,30 @@ def _cluster(resource: str) -> int:
     return int(ray.cluster_resources().get(resource, 0))
 
 
-def _require(ranks: int, resource: str) -> None:
-    available = _cluster(resource)
-    if available < ranks:
+def _require(recipe: TrainingRecipe, resource: str) -> None:
+    key = "fewest_ranks" if recipe.fewest_ranks else "ranks"
+    wanted, available = getattr(recipe, key), _cluster(resource)
+    if available < wanted:
         raise TrainingError(
-            f"training.ranks is {ranks}, but the cluster has {available} {resource}s. "
-            f"Use --set training.ranks={max(1, available)}, or add machines"
+            f"training.{key} is {wanted}, but the cluster has {available} {resource}s. "
+            f"Use --set training.{key}={max(1, available)}, or add machines"
         )
 
 
-def _recipe_in(path: Path) -> TrainingRecipe:
-    """The training section in a file; JSON needs no YAML reader.
-
-    Raises
-    ------
-    RecipeError
-        It cannot be read, or is no such section.
-    """
-    try:
-        text = path.read_text()
-        if path.suffix == ".json":
-            return TrainingRecipe.model_validate(json.loads(text))
-        import yaml
-
-        return TrainingRecipe.model_validate(yaml.safe_load(text))
-    except (OSError, ValueError) as error:  # pydantic's and JSON's are ValueErrors
-        raise RecipeError(f"{path} is no readable training recipe: {str(error).splitlines()[0]}") from error
-
-
 def main() -> None:
-    """Entry point for torchrun, and for a machine without Ray: RECIPE.yaml|json (a training section) DATA.zarr RUN."""
-    if len(sys.argv) != 4:
-        print("usage: python -m training.launch RECIPE.yaml DATA.zarr RUN", file=sys.stderr)
+    """Entry point for torchrun, and for a machine without Ray; see :func:`training.recipe_file.recipe_in`."""
+    if len(sys.argv) < 4:
+        print("usage: python -m training.launch RECIPE.yaml|json DATA.zarr RUN [key=value ...]", file=sys.stderr)
         sys.exit(2)
-    recipe_path, data, run = sys.argv[1:]
+    recipe_path, data, run, *words = sys.argv[1:]
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     try:
-        train(_recipe_in(Path(recipe_path)), data=data, run=Path(run))
-    except DsffnetError as error:
+        train(recipe_in(Path(recipe_path), words), data=data, run=Path(run))
+    except (DsffnetError, OSError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         # The group is not left after an error, and taking the interpreter down with its threads alive can abort (-6).
-        os._exit(error.exit_status)
+        os._exit(getattr(error, "exit_status", 1))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The load of this machine, under the names that MLflow gives to system metrics, so that its UI shows them as such."""
 
+import contextlib
 import importlib
 import logging
 import shutil
@@ -8,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -16,6 +18,7 @@ from training.journal import Journal
 
 log = logging.getLogger(__name__)
 _QUERY = ("nvidia-smi", "--query-gpu=utilization.gpu,memory.used,memory.total", "--format=csv,noheader,nounits")
+_MIB = 1.048576  # megabytes in one, which nvidia-smi counts in
 
 
 @contextmanager
@@ -69,40 +72,53 @@ def gpu_reader() -> Callable[[], dict[str, float]]:
         return _from_nvidia_smi if shutil.which(_QUERY[0]) else dict
 
     def read() -> dict[str, float]:
-        rows = []
-        for handle in handles:
-            memory = nvml.nvmlDeviceGetMemoryInfo(handle)
-            rows.append((nvml.nvmlDeviceGetUtilizationRates(handle).gpu, memory.used / 1e6, memory.total / 1e6))
-        return _named(rows)
+        return _named([_row(nvml, handle) for handle in handles])
 
     return read
+
+
+def _row(nvml: Any, handle: Any) -> tuple[float | None, ...]:
+    """Use, memory used and memory in all of one GPU; None for what it does not tell (its parts under MIG, say)."""
+    use = memory = None
+    with contextlib.suppress(nvml.NVMLError):
+        use = nvml.nvmlDeviceGetUtilizationRates(handle).gpu
+    with contextlib.suppress(nvml.NVMLError):
+        memory = nvml.nvmlDeviceGetMemoryInfo(handle)
+    return use, memory and memory.used / 1e6, memory and memory.total / 1e6
 
 
 def _from_nvidia_smi() -> dict[str, float]:
     try:
         done = subprocess.run(_QUERY, capture_output=True, text=True, timeout=5, check=True)
-        rows = [[float(value) for value in line.split(",")] for line in done.stdout.splitlines() if line.strip()]
-        return _named([(use, used * 1.048576, total * 1.048576) for use, used, total in rows])  # it counts in MiB
-    except (OSError, subprocess.SubprocessError, ValueError):  # ValueError: "[N/A]", on a GPU that is cut in parts
+    except (OSError, subprocess.SubprocessError):
         return {}
+    rows = [[_number(value) for value in line.split(",")] for line in done.stdout.splitlines() if line.count(",") == 2]
+    return _named([(use, used and used * _MIB, total and total * _MIB) for use, used, total in rows])
 
 
-def _named(rows: list[tuple[float, float, float]]) -> dict[str, float]:
+def _number(text: str) -> float | None:
+    """None for "[N/A]", on a GPU that is cut in parts."""
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _named(rows: list[tuple[float | None, ...]]) -> dict[str, float]:
     found = {}
     for index, (use, used, total) in enumerate(rows):
         found[f"gpu_{index}_utilization_percentage"] = use
         found[f"gpu_{index}_memory_usage_megabytes"] = used
-        found[f"gpu_{index}_memory_usage_percentage"] = 100 * used / total
-    return found
+        found[f"gpu_{index}_memory_usage_percentage"] = 100 * used / total if used is not None and total else None
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _sample(path: Path, stop: threading.Event, every: float) -> None:
     try:
-        journal = Journal(path)
-        load, step = MachineLoad(path.parent), journal.next_step
-        while not stop.wait(every):
-            journal.write(step, load.read())
-            step += 1
-        journal.close()
+        with contextlib.closing(Journal(path)) as journal:
+            load, step = MachineLoad(path.parent), journal.next_step
+            while not stop.wait(every):
+                journal.write(step, load.read())
+                step += 1
     except (StorageError, OSError, psutil.Error) as error:
         log.warning("the load of this machine is no longer noted in %s: %s", path, error)

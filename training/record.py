@@ -10,6 +10,7 @@ import os
 import sys
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -98,12 +99,20 @@ def end_record(folder: Path, status: Status) -> None:
 
 def find_records(root: Path) -> list[Path]:
     """Folders below ``root`` that hold a record, and those of their parents, parents first."""
-    found = {path.parent.resolve() for path in root.rglob(FILE)}
+    found = {folder.resolve() for folder in _with_records(root)}
     for folder in list(found):
         record = read_record(folder)
         if record and record.parent and read_record((folder / record.parent).resolve()):
             found.add((folder / record.parent).resolve())
     return sorted(found, key=lambda folder: (_has_parent(folder), _start_of(folder)))
+
+
+def _with_records(root: Path) -> Iterator[Path]:
+    """Folders below ``root`` that hold a record; not those of many files and no record, such as a dataset's."""
+    for folder, below, files in os.walk(root):
+        below[:] = [name for name in below if name not in ("checkpoints", "mlartifacts") and not name.endswith(".zarr")]
+        if FILE in files:
+            yield Path(folder)
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, str]:

@@ -26,7 +26,7 @@ def examples_of(
         triples = evaluation_list(dataset, recipe, pose_type)[: recipe.examples]
         if not len(triples):
             continue
-        outputs = predict(network, read_batch(dataset, triples)).double().numpy()
+        outputs = predict(network, read_batch(dataset, triples, padded=True)).double().numpy()
         for place, (triple, output) in enumerate(zip(triples, outputs, strict=True)):
             found.append(_example(dataset, pose_type, place, [int(number) for number in triple], output, rows))
     return found
@@ -43,7 +43,7 @@ def _example(
         title=f"{pose_type} pose {source_pose}, from identity {source_identity} to new identity {target_identity}",
         source=Mesh(dataset.vertices(source_identity, source_pose), dataset.faces(source_identity)),
         target=Mesh(dataset.vertices(target_identity, target_pose), faces),
-        output=Mesh(bounding_box(truth).restore(output), faces),
+        output=Mesh(bounding_box(truth).restore(output[: len(truth)]), faces),
         truth=Mesh(truth, faces),
         metrics=f"PMD {row.pmd * 1e4:.1f}e-4, mean error {row.millimetres:.0f} mm",
     )

@@ -6,6 +6,7 @@ value) once, and runs and models bear the record's id, by which they are found b
 """
 
 import hashlib
+import importlib.util
 import json
 import logging
 import os
@@ -51,6 +52,8 @@ def publish(root: Path, server: Server) -> None:
     TrackingError
         The server cannot be reached or refuses; repeat later.
     """
+    if importlib.util.find_spec("mlflow") is None:
+        raise TrackingError(f"MLflow is not installed here. Where it is, {_how_to_sync(root, server)} sends {root}")
     import mlflow
 
     for chatty in ("mlflow", "alembic"):
@@ -68,8 +71,13 @@ def publish(root: Path, server: Server) -> None:
         reason = (str(failures[0]).splitlines() or [type(failures[0]).__name__])[0][:200]
         raise TrackingError(
             f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
-            f"dsffnet sync {shlex.quote(str(root))} --tracking-uri {shlex.quote(server.uri)} sends what is missing"
+            f"{_how_to_sync(root, server)} sends what is missing"
         ) from failures[0]
+
+
+def _how_to_sync(root: Path, server: Server | None) -> str:
+    uri = f" --tracking-uri {shlex.quote(server.uri)}" if server else ""
+    return f"dsffnet sync {shlex.quote(str(root))}{uri}"
 
 
 def _publish_record(client: Any, server: Server, folder: Path, failures: list[Exception]) -> None:
@@ -337,13 +345,21 @@ class Mirror:
         self._root, self._server, self._every, self._after_failure = root, server, every, after_failure
         self._stop = threading.Event()
         self._failed: TrackingError | None = None
+        self._on = False
         self._thread = threading.Thread(target=self._follow, name="mlflow-mirror", daemon=True)
 
     def start(self) -> None:
-        self._thread.start()
+        """Begin, unless MLflow is not installed here: then records wait for a machine that has it."""
+        self._on = importlib.util.find_spec("mlflow") is not None
+        if self._on:
+            self._thread.start()
+        else:
+            log.warning("MLflow is not installed here, so nothing is sent. Later: %s", _how_to_sync(self._root, None))
 
     def close(self) -> TrackingError | None:
         """Stop, publish once more, and return what went wrong if that did not work."""
+        if not self._on:
+            return None
         self._stop.set()
         self._thread.join()
         self._publish()

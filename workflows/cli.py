@@ -2,13 +2,14 @@
 
 import argparse
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from datagen.errors import DatasetError
 from workflows.commands import add_command
 from workflows.console import add_recipe_options, add_tracking_option, guarded, server_of, server_of_record
 from workflows.data_commands import add_data_commands
+from workflows.evaluated import which_checkpoint
 from workflows.recipe import load_recipe
 from workflows.sweep_command import add_sweep_options, sweep_command
 
@@ -33,7 +34,7 @@ def train_command(options: argparse.Namespace) -> None:
     if options.fresh:
         with alone_in(run, ".driver.lock"):
             remove_run(run)
-    with _mirrored(run, options), ray_cluster():
+    with _mirrored(run, options), ray_cluster() if recipe.launcher == "ray" else nullcontext():
         train_stage(recipe, data, run, parent=None)
     print(f"trained: {options.out}. Next: dsffnet evaluate {options.out} --data {options.data}")
 
@@ -41,27 +42,29 @@ def train_command(options: argparse.Namespace) -> None:
 def evaluate_command(options: argparse.Namespace) -> None:
     """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run."""
     from datagen.store import open_dataset
-    from training.checkpoint import require_checkpoint
     from training.record import read_record
     from workflows.cluster import ray_cluster, require_reachable
+    from workflows.evaluated import evaluated
     from workflows.pipeline import evaluate_stage
 
     recipe = load_recipe(options.recipe, options.set).evaluation
-    run = Path(require_reachable(options.run, option="RUN"))
-    require_checkpoint(run)
-    open_dataset(options.data)
-    with _mirrored(run, options), ray_cluster():
-        parent = run if read_record(run) else None
-        print(evaluate_stage(recipe, require_reachable(options.data, option="--data", urls=True), run, parent=parent))
+    place = Path(require_reachable(options.run, option="RUN"))
+    home, data = evaluated(place, options.checkpoint).home, require_reachable(options.data, option="--data", urls=True)
+    open_dataset(data)
+    with _mirrored(home, options), ray_cluster():
+        parent = home if read_record(home) else None
+        print(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
 
 
 def transfer_command(options: argparse.Namespace) -> None:
     """Pose one mesh like another."""
     from datagen.mesh import load_mesh, save_mesh
+    from training.checkpoint import require_checkpoint
     from training.transfer import PoseTransfer
 
     source, target = load_mesh(options.source), load_mesh(options.target)
-    posed = PoseTransfer.from_run(options.model)(source=source, target=target)
+    weights = require_checkpoint(Path(options.model), options.checkpoint).path
+    posed = PoseTransfer.from_run(weights)(source=source, target=target)
     save_mesh(posed, options.out)
     print(f"{options.out}: {len(posed.vertices):,} vertices of {options.target} in the pose of {options.source}")
 
@@ -95,6 +98,7 @@ _EXAMPLES = {
   dsffnet train --recipe quickstart --set training.steps=8000 --data data/quickstart.zarr --out runs/longer""",
     evaluate_command: """\
   dsffnet evaluate runs/first --data data/quickstart.zarr
+  dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
   dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
     transfer_command: """\
   dsffnet transfer --model runs/quickstart/run --source pose.obj --target person.obj --out posed.obj""",
@@ -127,7 +131,8 @@ def _parser() -> argparse.ArgumentParser:
     add_tracking_option(train)
 
     evaluate = add_command(commands, evaluate_command, _EXAMPLES[evaluate_command], takes_recipe=True)
-    evaluate.add_argument("run", metavar="RUN", help="run folder of a training")
+    evaluate.add_argument("run", metavar="RUN", help="run folder of a training, a workflow's, a checkpoint or weights")
+    _add_checkpoint(evaluate)
     evaluate.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset")
     add_recipe_options(evaluate)
     add_tracking_option(evaluate)
@@ -135,7 +140,8 @@ def _parser() -> argparse.ArgumentParser:
     add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
 
     transfer = add_command(commands, transfer_command, _EXAMPLES[transfer_command])
-    transfer.add_argument("--model", required=True, metavar="RUN", help="run folder of a training")
+    transfer.add_argument("--model", required=True, metavar="RUN", help="run folder of a training, or weights")
+    _add_checkpoint(transfer)
     transfer.add_argument("--source", required=True, metavar="A", help="mesh in the wanted pose")
     transfer.add_argument("--target", required=True, metavar="B", help="mesh of the wanted identity")
     transfer.add_argument("--out", required=True, metavar="C", help="mesh to write (.obj .ply .off .glb .stl)")
@@ -146,6 +152,16 @@ def _parser() -> argparse.ArgumentParser:
 
     add_recipe_options(add_command(commands, recipe_command, _EXAMPLES[recipe_command], takes_recipe=True))
     return made
+
+
+def _add_checkpoint(made: argparse.ArgumentParser) -> None:
+    made.add_argument(
+        "--checkpoint",
+        type=which_checkpoint,
+        default="latest",
+        metavar="latest|best|STEP",
+        help="which of the run's weights (default latest)",
+    )
 
 
 @contextmanager

@@ -32,7 +32,8 @@ _OWN = (
 )
 _OF_A_RUN = (
     "recipe.yaml", "provenance.json", "record.json", "mlflow.json", "metrics.jsonl", "system.jsonl", "latest", "ray",
-    "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", ".mlflow.lock",
+    "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", "input.json",
+    ".mlflow.lock",
 )  # fmt: skip
 
 
@@ -142,12 +143,19 @@ def remove_run(run: Path) -> None:
     RecipeError
         The folder is not a training run's.
     """
-    record = read_record(run)
-    if run.exists() and any(run.iterdir()) and (record is None or record.kind != "train"):
+    if run.exists() and any(run.iterdir()) and not _is_training(run):
         raise RecipeError(f"{run} is not the folder of a training, so --fresh leaves it alone. Choose another --out")
     _remove(run, _OF_A_RUN)
     for folder in run.glob("evaluation*"):
         shutil.rmtree(folder)
+
+
+def _is_training(run: Path) -> bool:
+    """By its record, or, where torchrun trained without a workflow, by what every training writes."""
+    record = read_record(run)
+    if record is not None:
+        return record.kind == "train"
+    return (run / "checkpoints").is_dir() and (run / "metrics.jsonl").is_file()
 
 
 def _remove(folder: Path, names: Iterable[str]) -> None:

@@ -3,7 +3,7 @@
 import json
 import platform
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from datagen.mesh import bounding_box, write_atomically
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
-from training.checkpoint import CheckpointError, load_checkpoint, require_checkpoint
+from training.checkpoint import CheckpointError, Which, load_checkpoint, require_checkpoint
 from training.curves import draw_coefficients
 from training.evaluation import NO_OPS, Row, evaluate, write_rows
 from training.figures import contact_sheet
@@ -30,7 +30,9 @@ from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
 from training.triples import TripleOrder
 from workflows.console import alone_in
+from workflows.evaluated import evaluated
 from workflows.progress import bar, following, sampling
+from workflows.stages import say
 
 METHOD = "DSFFNet"
 
@@ -91,6 +93,7 @@ def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     steps = order.last_step(recipe.epochs, recipe.steps)
     with following(run / "metrics.jsonl", steps=steps, steps_per_epoch=order.steps_per_epoch):
         launch(recipe, data=dataset.url, run=run)
+    _say_where_meshes_were(run)
     reached = require_checkpoint(run)
     if not reached.finished:
         raise TrainingError(
@@ -102,27 +105,38 @@ def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     update_record(run, artifacts=artifacts, model=MODEL, model_version=f"{dataset.uuid} step {reached.step}")
 
 
-def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Path | None) -> str:
-    """Measure the run, write rows, tables, figures, meshes and viewer; returns the report."""
-    dataset, (network, _, step) = open_dataset(data), load_trained(run)
-    folder = evaluation_folder(run, dataset)
+def _say_where_meshes_were(run: Path) -> None:
+    """What rank 0 noted; its own log does not reach the driver of a local Ray."""
+    with suppress(OSError, ValueError, KeyError):
+        say(f"train: meshes were kept in {json.loads((run / 'input.json').read_text())['where']}")
+
+
+def evaluate_stage(
+    recipe: EvaluationRecipe, data: str, place: Path, *, parent: Path | None, which: Which = "latest"
+) -> str:
+    """Measure a run or weights, write rows, tables, figures, meshes and viewer; returns the report."""
+    dataset, what = open_dataset(data), evaluated(place, which)
+    network, _, step = load_trained(what.weights)
+    folder = what.folder(dataset)
     with recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=recipe.model_dump(mode="json")):
         with sampling(folder / "system.jsonl"):
             progress = partial(bar, what="evaluate", unit="task")
             rows = evaluate(
-                run, data, recipe, tasks=ray_runner, method=METHOD, progress=lambda chunks, n: progress(chunks, total=n)
+                what.weights,
+                data,
+                recipe,
+                tasks=ray_runner,
+                method=METHOD,
+                progress=lambda chunks, n: progress(chunks, total=n),
             )
         write_rows(rows, folder / "rows.csv")
         about = f"Weights of step {step:,} on {Path(dataset.url).name} ({dataset.uuid})."
         text = report(rows, title=_title(dataset), about=about, emd_points=_emd_points(recipe, dataset))
         write_atomically(folder / "tables.md", text.encode())
         draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
-        baselines = {
-            f"{name} (unseen)": mean_of(rows, method=name, pose_type="unseen", field="pmd")
-            for name in NO_OPS
-            if name in methods_of(rows)
-        }
-        draw_training_curve(run, folder / "figures" / "training-curve.png", baselines=baselines)
+        if (what.home / "metrics.jsonl").exists():  # exported weights have none
+            path = folder / "figures" / "training-curve.png"
+            draw_training_curve(what.home, path, baselines=_no_ops(rows))
         update_record(
             folder,
             dataset=about_dataset(dataset),
@@ -132,10 +146,10 @@ def evaluate_stage(recipe: EvaluationRecipe, data: str, run: Path, *, parent: Pa
     return text
 
 
-def evaluation_folder(run: Path, dataset: Dataset) -> Path:
-    """RUN/evaluation for the dataset that the run was trained on, RUN/evaluation-NAME for any other."""
-    own = require_checkpoint(run).dataset == dataset.uuid
-    return run / ("evaluation" if own else f"evaluation-{Path(dataset.url).stem}")
+def _no_ops(rows: list[Row]) -> dict[str, float]:
+    """PMD on unseen poses of the methods that do nothing."""
+    found = {name: [row.pmd for row in rows if (row.method, row.pose_type) == (name, "unseen")] for name in NO_OPS}
+    return {f"{name} (unseen)": float(np.mean(values)) for name, values in found.items() if values}
 
 
 def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
@@ -238,12 +252,19 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 
 def _title(dataset: Dataset) -> str:
     recipe = dataset.recipe
-    count = dataset.vertex_count(0)
-    return f"Pose transfer on {recipe.body.family} bodies of {count:,} vertices"
+    least, most = _vertex_counts(dataset)
+    counts = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    return f"Pose transfer on {recipe.body.family} bodies of {counts} vertices"
 
 
 def _emd_points(recipe: EvaluationRecipe, dataset: Dataset) -> int:
-    return min(recipe.emd_points, dataset.vertex_count(0))
+    return min(recipe.emd_points, _vertex_counts(dataset)[1])
+
+
+def _vertex_counts(dataset: Dataset) -> tuple[int, int]:
+    """The fewest and the most vertices of the identities that are evaluated."""
+    counts = [dataset.vertex_count(identity) for identity in dataset.identities("evaluation") or [0]]
+    return min(counts), max(counts)
 
 
 def write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:

@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -53,25 +53,20 @@ class _Lines:
 
 
 @contextmanager
-def following(
-    journal: Path, *, steps: int, system: Path | None = None, steps_per_epoch: int | None = None
-) -> Iterator[None]:
-    """Show how a training's journal grows while the block runs, and sample this machine's load into ``system``.
+def following(journal: Path, *, steps: int, steps_per_epoch: int | None = None) -> Iterator[None]:
+    """Show how a training's journal grows while the block runs.
 
     What the journal holds already is the past: it is shown, but the time left comes from what is added.
     """
     follower = _Follower(journal, Progress(steps=steps, steps_per_epoch=steps_per_epoch), steps)
     stop = threading.Event()
     thread = threading.Thread(target=follower.run, args=(stop,), name="progress", daemon=True)
-    with ExitStack() as around:
-        if system is not None:
-            around.enter_context(sampling(system))
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 class _Follower:

@@ -24,7 +24,6 @@ from training.record import end_record, read_record, update_record
 from training.showcase import draw_training_curve
 from workflows.console import WorkflowError, alone_in
 from workflows.pipeline import about_dataset, check_run_accepts, is_trained, recorded, write_run_head
-from workflows.progress import sampling
 from workflows.stages import say
 from workflows.trials import Trial
 
@@ -129,8 +128,9 @@ def ray_trials(
     import ray
 
     _require_room(cpus, gpus)
+    placed = [_on_device(trial, gpus) for trial in trials]  # before any is submitted: one that cannot be starts none
     task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_RETRIES)(train_trial)
-    running = {task.remote(_on_device(trial, gpus), place, tags=tags(trial), threads=cpus): trial for trial in trials}
+    running = {task.remote(trial, place, tags=tags(trial), threads=cpus): trial for trial in placed}
     try:
         with _heeding_sigterm() as told:
             while running:
@@ -159,8 +159,7 @@ def _train(trial: Trial, place: Place, run: Path, tags: dict[str, str]) -> None:
         update_record(run, tags=tags, dataset=about_dataset(dataset), artifacts=artifacts)
         try:
             write_run_head(recipe, dataset, run)
-            with sampling(run / "system.jsonl"):
-                launch(recipe, data=dataset.url, run=run)
+            launch(recipe, data=dataset.url, run=run)
             draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
         except TrainingStopped:
             raise

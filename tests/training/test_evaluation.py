@@ -7,13 +7,18 @@ import pytest
 import torch
 
 from datagen.errors import MeshError
-from datagen.generate import inline
-from datagen.mesh import Mesh, bounding_box
+from datagen.generate import generate, inline
+from datagen.mesh import Mesh, bounding_box, edges_of
 from datagen.store import open_dataset
+from tests.support.mixed import mixed_dataset
 from tests.support.recipes import tiny_training
+from training.batches import read_batch
 from training.checkpoint import CheckpointError, require_checkpoint
 from training.evaluation import NO_OPS, Row, evaluate, measure_chunk, read_rows, write_rows
+from training.inference import load_trained, predict
+from training.metrics import edge_length_ratio_error, point_mesh_distance
 from training.recipe import EvaluationRecipe
+from training.showcase import examples_of
 from training.tables import markdown, mean_of, methods_of, report, summary
 from training.trainer import train
 from training.transfer import PoseTransfer
@@ -55,6 +60,24 @@ def test_any_cutting_into_tasks_gives_the_same_rows(dataset: str, run: Path) -> 
     pieces = evaluate(run, dataset, RECIPE.model_copy(update={"chunk": 1}), tasks=reversed_tasks)
     assert [(r.method, r.pose_type, r.triple) for r in whole] == [(r.method, r.pose_type, r.triple) for r in pieces]
     assert [r.pmd for r in whole] == pytest.approx([r.pmd for r in pieces], rel=1e-4)
+
+
+def test_meshes_of_other_counts_are_each_measured_over_their_own_vertices(tmp_path: Path) -> None:
+    data = generate(mixed_dataset(), str(tmp_path / "mixed.zarr"))
+    train(tiny_training(steps=2), data=data.url, run=tmp_path / "run")
+    rows = evaluate(tmp_path / "run", data.url, RECIPE, tasks=inline)
+    assert methods_of(rows) == ["DSFFNet", NO_OPS[0]], "a source of another count can stand for no output"
+    assert len({data.vertex_count(row.target_identity) for row in rows}) > 1
+    network = load_trained(tmp_path / "run")[0]
+    for row in rows:
+        alone = np.array([[row.source_identity, row.source_pose, row.target_identity, row.target_pose]])
+        batch = read_batch(data, alone)
+        output = batch.target if row.method == NO_OPS[0] else predict(network, batch)
+        edges = torch.from_numpy(edges_of(data.faces(row.target_identity)))
+        assert row.pmd == pytest.approx(float(point_mesh_distance(output, batch.truth)), rel=1e-4)
+        assert row.edge_ratio == pytest.approx(float(edge_length_ratio_error(output, batch.truth, edges)), rel=1e-4)
+    examples = examples_of(data, network, RECIPE, rows)
+    assert all(example.output.vertices.shape == example.truth.vertices.shape for example in examples)
 
 
 def test_rows_survive_csv(dataset: str, run: Path, tmp_path: Path) -> None:

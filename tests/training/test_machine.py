@@ -28,6 +28,7 @@ def test_gpus_by_pynvml(monkeypatch: pytest.MonkeyPatch) -> None:
         nvmlDeviceGetHandleByIndex=lambda index: index,
         nvmlDeviceGetMemoryInfo=lambda handle: memory,
         nvmlDeviceGetUtilizationRates=lambda handle: types.SimpleNamespace(gpu=50 + handle),
+        NVMLError=RuntimeError,
     )
     monkeypatch.setitem(sys.modules, "pynvml", nvml)
     found = gpu_reader()()
@@ -35,9 +36,28 @@ def test_gpus_by_pynvml(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["gpu_1_memory_usage_percentage"] == 25 and len(found) == 6
 
 
+def test_what_a_gpu_does_not_tell_is_left_out_and_the_rest_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    class NVMLError(Exception):
+        pass
+
+    def unsupported(handle: int) -> None:
+        raise NVMLError("Not Supported")
+
+    nvml = types.SimpleNamespace(
+        nvmlInit=lambda: None,
+        nvmlDeviceGetCount=lambda: 1,
+        nvmlDeviceGetHandleByIndex=lambda index: index,
+        nvmlDeviceGetMemoryInfo=lambda handle: types.SimpleNamespace(used=1e9, total=4e9),
+        nvmlDeviceGetUtilizationRates=unsupported,
+        NVMLError=NVMLError,
+    )
+    monkeypatch.setitem(sys.modules, "pynvml", nvml)
+    assert gpu_reader()() == {"gpu_0_memory_usage_megabytes": 1000, "gpu_0_memory_usage_percentage": 25}
+
+
 @pytest.mark.parametrize(
     ("answer", "expected"),
-    [("87, 1000, 4000\n12, 0, 4000", (87.0, 1048.576, 25.0)), ("[N/A], 1, 2", None), ("", None)],
+    [("87, 1000, 4000\n12, 0, 4000", (87.0, 1048.576, 25.0)), ("[N/A], [N/A], [N/A]", None), ("", None)],
 )
 def test_gpus_by_nvidia_smi(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, expected: tuple[float, ...] | None

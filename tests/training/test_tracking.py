@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,26 @@ def test_syncing_a_child_alone_brings_its_parent(root: Path, server: Server) -> 
     assert [os.path.basename(folder) for folder in find_records(root / "run")] == ["workflow", "run"]
     publish(root / "run", server)
     assert set(runs_of(server)) == {"quick", "train"}
+
+
+def test_records_are_not_sought_among_shards_checkpoints_and_copies(root: Path) -> None:
+    before = find_records(root)
+    for place in ("data.zarr/identity", "run/checkpoints/step-00000001", "mlartifacts/1"):
+        (root / place).mkdir(parents=True)
+        (root / place / "record.json").write_text("no record")
+    assert find_records(root) == before and len(before) > 1
+
+
+def test_without_mlflow_nothing_is_sent_and_one_line_says_so(root: Path, caplog, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "mlflow", None)
+    mirror = Mirror(root, Server("http://127.0.0.1:9"), every=0.01)
+    mirror.start()
+    assert mirror.close() is None
+    assert [record.message for record in caplog.records] == [
+        f"MLflow is not installed here, so nothing is sent. Later: dsffnet sync {root}"
+    ]
+    with pytest.raises(TrackingError, match="MLflow is not installed here"):
+        publish(root, Server("http://127.0.0.1:9"))
 
 
 def test_another_server_gets_runs_of_its_own(root: Path, server: Server, empty_store: Path, tmp_path: Path) -> None:

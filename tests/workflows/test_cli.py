@@ -1,5 +1,6 @@
 """The ``dsffnet`` command and the workflow script as a person types them: output, one clear error, exit status."""
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from datagen.mesh import Mesh, load_mesh, save_mesh
 from datagen.store import open_dataset
-from tests.support.commands import command, fails
+from tests.support.commands import ROOT, command, fails
 from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
@@ -88,6 +89,25 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
     fails(transfer("good.obj", model=tmp_path / "norun"), 1, "norun has no usable checkpoint")
     fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
     assert not list(tmp_path.glob("out*"))
+
+
+def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = sys.modules['mlflow'] = None\n")
+    recipe = ("--recipe", "smoke", "--set", "training.launcher=inline", "training.ranks=1", "training.steps=2")
+    place = ("--data", trained[0], "--out", tmp_path / "run")
+    done = command("train", *recipe, *place, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    assert done.returncode == 0 and "trained: " in done.stdout, done.stderr
+    assert done.stderr.count("MLflow is not installed here") == 1 and "Traceback" not in done.stderr
+
+
+def test_a_checkpoint_is_chosen(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    opened = open_dataset(str(trained[0]))
+    save_mesh(Mesh(opened.vertices(3, 7), opened.faces(3)), tmp_path / "a.obj")
+    meshes = ("--source", tmp_path / "a.obj", "--target", tmp_path / "a.obj", "--out", tmp_path / "b.obj")
+    done = command("transfer", "--model", trained[1], "--checkpoint", "4", *meshes)
+    assert done.returncode == 0, done.stderr
+    fails(command("transfer", "--model", trained[1], "--checkpoint", "5", *meshes), 1, "step-00000005")
+    assert command("transfer", "--model", trained[1], "--checkpoint", "newest", *meshes).returncode == 2
 
 
 def test_bad_recipes_and_usage_exit_2(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def test_a_log_gets_lines_and_no_control_characters(
 ) -> None:
     monkeypatch.setattr(progress, "_QUIET_SECONDS", 0.6)
     journal = Journal(tmp_path / "m.jsonl")
-    with following(tmp_path / "m.jsonl", steps=60, steps_per_epoch=20, system=tmp_path / "s.jsonl"):
+    with following(tmp_path / "m.jsonl", steps=60, steps_per_epoch=20):
         write(journal, 1, 61, pause=0.05)
     lines = capfd.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 8, lines

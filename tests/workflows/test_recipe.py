@@ -18,6 +18,15 @@ def test_every_shipped_recipe_loads_and_describes_itself(name: str) -> None:
     assert load_recipe(name).description
 
 
+def test_the_papers_training_on_one_gpu() -> None:
+    recipe, paper = load_recipe("gpu-paper"), load_recipe("anny-paper", ["training=dsffnet-paper"])
+    assert recipe.data == paper.data
+    paper.training.require_same_learning(recipe.training.model_copy(update={"precision": "float32"}), where="gpu-paper")
+    its = recipe.training
+    assert (its.precision, its.compile, its.device, its.launcher) == ("bfloat16", True, "cuda", "inline")
+    assert (its.budget, its.evaluate_every, its.checkpoint_every) == ("9min", 2000, 2000)
+
+
 def test_the_quickstart_is_what_the_readme_says() -> None:
     recipe = load_recipe("quickstart")
     assert recipe.data.identities.training == 16 and recipe.data.poses.seen >= 200

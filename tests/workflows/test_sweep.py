@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +25,22 @@ from tests.support.recipes import tiny_dataset, tiny_training
 from training.checkpoint import require_checkpoint
 from training.inference import load_trained
 from training.journal import read_journal
-from training.ranks import STOP_FILE, StopRequest, TrainingStopped
-from training.record import read_record
+from training.ranks import STOP_FILE, StopRequest, TrainingError, TrainingStopped
+from training.recipe import TrainingRecipe
+from training.record import flatten, read_record
 from training.trainer import train
 from workflows import sweeping
 from workflows.console import WorkflowError
 from workflows.grids import parse_grid, split_values
+from workflows.named_recipes import named_training
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
 from workflows.sweep_report import parse_levels
 from workflows.sweeping import Settings, judge, remove_sweep, run_sweep
-from workflows.trial_runs import Outcome, Place, train_trial
+from workflows.trial_runs import Outcome, Place, ray_trials, train_trial
 from workflows.trials import Sweep, Trial, known_sweeps, plan_sweep, read_sweep
 
 ROOT = Path(__file__).parents[2]
+HOST = {"Alive": True, "Resources": {"CPU": 2.0}}
 THREE = [
     {"name": "slow", "description": "hardly moves", "set": ["training.learning_rate=1e-6"]},
     {"name": "wild", "set": ["training.learning_rate=1e30", "training.gradient_clip=null"]},
@@ -211,6 +216,29 @@ def test_named_sweeps_resolve_and_give_every_trial_the_same_number_of_triples(na
     assert budgets == {12_000}
     if name == "networks":
         assert {trial.training.network.name for trial in sweep.trials} == {"dsffnet", "npt", "corenet3d"}
+
+
+@pytest.mark.parametrize("network", ["npt", "corenet3d"])
+def test_published_trials_are_the_published_recipes_at_other_widths(network: str) -> None:
+    trials = {trial.name: trial for trial in plan_sweep(recipe=None, shared=[], trials="networks").trials}
+    trial = flatten(trials[f"{network}-published"].training.model_dump(mode="json"))
+    published = flatten(TrainingRecipe.model_validate(named_training(f"{network}-paper")).model_dump(mode="json"))
+    elsewhere = {"steps", "launcher", "device", "evaluate_every", *(key for key in published if "widths" in key)}
+    assert {key: trial[key] for key in published.keys() - elsewhere} == {
+        key: published[key] for key in published.keys() - elsewhere
+    }
+
+
+def test_a_trial_that_cannot_be_placed_starts_none(three: Sweep, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    submitted: list[str] = []
+    task = types.SimpleNamespace(remote=lambda trial, *_, **__: submitted.append(trial.name))
+    ray = types.SimpleNamespace(remote=lambda **_: lambda function: task, nodes=lambda: [HOST])
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    first, last = three.trials[0], three.trials[-1]
+    on_gpu = last.recipe.model_copy(update={"training": last.recipe.training.model_copy(update={"device": "cuda"})})
+    with pytest.raises(TrainingError, match="trial good has training.device=cuda"):
+        next(ray_trials([first, replace(last, recipe=on_gpu)], Place("x", out, "mark"), tags=lambda _: {}))
+    assert submitted == []
 
 
 def test_a_trial_that_diverges_is_recorded_with_its_reason_and_the_others_go_on(swept: Path) -> None:
