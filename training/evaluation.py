@@ -69,7 +69,7 @@ def evaluate(
 
     ``tasks`` runs functions over argument tuples here or on a cluster (see ``datagen.generate``).
     """
-    dataset, checkpoint = open_dataset(data), require_checkpoint(run).path
+    dataset, checkpoint = open_dataset(data), require_checkpoint(run, "result").path
     arguments = [
         (str(checkpoint), data, recipe, method, pose_type, start)
         for pose_type in POSE_TYPES

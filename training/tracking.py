@@ -257,7 +257,7 @@ class _Publication:
 
         from training.checkpoint import export_weights, require_checkpoint
 
-        checkpoint = require_checkpoint(self.folder)
+        checkpoint = require_checkpoint(self.folder, "result")
         packages = [Path(__file__).parent, Path(__file__).parents[1] / "datagen"]
         with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
             export_weights(checkpoint, Path(temporary) / "weights")

@@ -158,9 +158,9 @@ def _add_checkpoint(made: argparse.ArgumentParser) -> None:
     made.add_argument(
         "--checkpoint",
         type=which_checkpoint,
-        default="latest",
-        metavar="latest|best|STEP",
-        help="which of the run's weights (default latest)",
+        default="result",
+        metavar="result|latest|best|STEP",
+        help="which of the run's weights (result: the best where early stopping ended the run, else the latest)",
     )
 
 

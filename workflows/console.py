@@ -32,7 +32,7 @@ _OWN = (
 )
 _OF_A_RUN = (
     "recipe.yaml", "provenance.json", "record.json", "mlflow.json", "metrics.jsonl", "system.jsonl", "latest", "ray",
-    "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", "input.json",
+    "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", "input.json", "not-finite.json",
     ".mlflow.lock",
 )  # fmt: skip
 

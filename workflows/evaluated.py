@@ -8,7 +8,7 @@ from datagen.store import Dataset
 from training.checkpoint import Checkpoint, Which, require_checkpoint
 
 _WEIGHTS = ".safetensors"
-_WORDS: dict[str, Which] = {"latest": "latest", "best": "best"}
+_WORDS: dict[str, Which] = {"result": "result", "latest": "latest", "best": "best"}
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class Evaluated:
     """Weights to evaluate: their checkpoint, the folder that their evaluation goes into, and what it is called by.
 
     ``home`` is the run, or for exported weights their folder; ``label`` tells weights of one home apart ("": the
-    newest of a run, or those that were exported as weights.safetensors).
+    result of a run, or those that were exported as weights.safetensors).
     """
 
     checkpoint: Checkpoint
@@ -35,7 +35,7 @@ class Evaluated:
         return self.home / "-".join(filter(None, ("evaluation", other, self.label)))
 
 
-def evaluated(place: Path, which: Which = "latest") -> Evaluated:
+def evaluated(place: Path, which: Which = "result") -> Evaluated:
     """The weights that a person names: a run, a workflow's folder, RUN/checkpoints/step-N, or exported weights.
 
     Raises
@@ -50,17 +50,17 @@ def evaluated(place: Path, which: Which = "latest") -> Evaluated:
         is_file = place.suffix == _WEIGHTS
         label = place.stem if is_file and place.stem != "weights" else ""
         return Evaluated(checkpoint, place.parent if is_file else place, label)
-    label = "" if which == "latest" else f"step-{checkpoint.step}"
+    label = "" if which in ("result", "latest") else f"step-{checkpoint.step}"
     return Evaluated(checkpoint, checkpoint.path.parent.parent, label)
 
 
 def which_checkpoint(word: str) -> Which:
-    """``latest``, ``best`` or a step, as it comes from a command line."""
+    """``result``, ``latest``, ``best`` or a step, as it comes from a command line."""
     if word in _WORDS:
         return _WORDS[word]
     if word.isdecimal():
         return int(word)
-    raise argparse.ArgumentTypeError(f"{word!r} is neither latest nor best nor a step such as 2000")
+    raise argparse.ArgumentTypeError(f"{word!r} is none of result, latest, best, nor a step such as 2000")
 
 
 def _step_folder(place: Path) -> Path | None:

@@ -17,8 +17,9 @@ from datagen.mesh import bounding_box, write_atomically
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
-from training.checkpoint import CheckpointError, Which, load_checkpoint, require_checkpoint
+from training.checkpoint import CheckpointError, Which, is_finished, load_checkpoint, require_checkpoint
 from training.curves import draw_coefficients
+from training.earlier import recipe_of
 from training.evaluation import NO_OPS, Row, evaluate, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
@@ -95,14 +96,19 @@ def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
         launch(recipe, data=dataset.url, run=run)
     _say_where_meshes_were(run)
     reached = require_checkpoint(run)
-    if not reached.finished:
+    if not is_finished(reached, steps):
         raise TrainingError(
             f"training in {run} ended at step {reached.step} of {steps}. Run the same command again to go on"
         )
     draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
     draw_coefficients(run, run / "figures" / "adaptive-coefficients.png")
     artifacts += [name for name in ("metrics.jsonl", "figures", "pictures") if (run / name).exists()]
-    update_record(run, artifacts=artifacts, model=MODEL, model_version=f"{dataset.uuid} step {reached.step}")
+    update_record(
+        run,
+        artifacts=artifacts,
+        model=MODEL,
+        model_version=f"{dataset.uuid} step {require_checkpoint(run, 'result').step}",
+    )
 
 
 def _say_where_meshes_were(run: Path) -> None:
@@ -112,7 +118,7 @@ def _say_where_meshes_were(run: Path) -> None:
 
 
 def evaluate_stage(
-    recipe: EvaluationRecipe, data: str, place: Path, *, parent: Path | None, which: Which = "latest"
+    recipe: EvaluationRecipe, data: str, place: Path, *, parent: Path | None, which: Which = "result"
 ) -> str:
     """Measure a run or weights, write rows, tables, figures, meshes and viewer; returns the report."""
     dataset, what = open_dataset(data), evaluated(place, which)
@@ -168,7 +174,7 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> No
             f"{run} was trained on dataset {found.dataset}, not on {dataset.url} ({dataset.uuid}). "
             "Choose another --out, or add --fresh to start over"
         )
-    recipe.require_same_learning(TrainingRecipe.model_validate(found.recipe), where=str(run))
+    recipe.require_same_learning(recipe_of(found), where=str(run))
 
 
 def order_of(recipe: TrainingRecipe, dataset: Dataset) -> TripleOrder:
@@ -195,7 +201,7 @@ def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
     try:
         dataset, found = open_dataset(data), load_checkpoint(run)
         check_run_accepts(recipe, dataset, run)
-        return found is not None and found.finished
+        return found is not None and is_finished(found, last_step(recipe, dataset))
     except DsffnetError:
         return False
 
