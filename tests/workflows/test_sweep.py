@@ -236,7 +236,7 @@ def test_a_trial_that_cannot_be_placed_starts_none(three: Sweep, out: Path, monk
     monkeypatch.setitem(sys.modules, "ray", ray)
     first, last = three.trials[0], three.trials[-1]
     on_gpu = last.recipe.model_copy(update={"training": last.recipe.training.model_copy(update={"device": "cuda"})})
-    with pytest.raises(TrainingError, match="trial good has training.device=cuda"):
+    with pytest.raises(TrainingError, match=r"trial good has training\.device=cuda"):
         next(ray_trials([first, replace(last, recipe=on_gpu)], Place("x", out, "mark"), tags=lambda _: {}))
     assert submitted == []
 
