@@ -18,7 +18,7 @@ from typing import Any
 
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
-from training.ranks import STOP_FILE, TrainingError, TrainingStopped
+from training.ranks import STOP_FILE, Ranks, TrainingError, TrainingStopped, device_of
 from training.recipe import TrainingRecipe, budget_seconds
 from training.recipe_file import recipe_in
 from training.trainer import train
@@ -43,7 +43,7 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
         Whatever :func:`training.trainer.train` raises.
     """
     if recipe.launcher == "inline":
-        _say("1 rank in this process", recipe.device)
+        _say("1 rank in this process", str(device_of(recipe, Ranks.from_environment())))
         train(recipe, data=data, run=run)
     else:
         _with_ray(recipe, data, run)
