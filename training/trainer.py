@@ -6,6 +6,7 @@ optimiser, the average of its weights and a few numbers.
 """
 
 import contextlib
+import json
 import logging
 import time
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from datagen.mesh import write_atomically
 from datagen.store import Dataset, open_dataset
 from training.augmentation import Augmentation
 from training.banks import Bank, open_bank
@@ -163,6 +165,7 @@ class _Trainer:
         self.probe, self.journal = None, None
         if self.is_writer:
             log.info("training meshes are kept in %s", self.bank.where)
+            write_atomically(self.folder / "input.json", json.dumps({"where": self.bank.where}).encode())
             self.probe = Probe(self.dataset, self.recipe, self.device, self.learner.dtype)
             self.journal = Journal(self.folder / "metrics.jsonl")
             around.callback(self.journal.close)
