@@ -227,13 +227,17 @@ def main() -> None:
         sys.exit(2)
     recipe_path, data, run, *words = sys.argv[1:]
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
+    status = 0
     try:
         train(recipe_in(Path(recipe_path), words), data=data, run=Path(run))
     except (DsffnetError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        sys.stdout.flush()
-        # The group is not left after an error, and taking the interpreter down with its threads alive can abort (-6).
-        os._exit(getattr(error, "exit_status", 1))
+        print(f"error: {error}", file=sys.stderr)
+        status = getattr(error, "exit_status", 1)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # All is on the disk. Taking the interpreter down can abort (-6), after a clean end too: what is left of a process
+    # group ends its threads in an order of its own.
+    os._exit(status)
 
 
 if __name__ == "__main__":

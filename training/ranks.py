@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import gc
 import os
 import signal
 import threading
@@ -112,6 +113,7 @@ def process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
     backend = "nccl" if torch.cuda.is_available() and recipe.device != "cpu" else "gloo"
     dist.init_process_group(backend, timeout=datetime.timedelta(seconds=recipe.timeout))
     yield
+    gc.collect()  # a model in a cycle of references would hold the group beyond its end
     dist.barrier()
     dist.destroy_process_group()
 

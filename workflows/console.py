@@ -44,7 +44,7 @@ class WorkflowError(DsffnetError):
 def guarded(main: Callable[[], None]) -> None:
     """Run a command; what a person can mend becomes one line on standard error and an exit status.
 
-    Status 0: done, 1: failed, 2: usage or an invalid recipe, 130: interrupted, 143: told to stop.
+    Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
