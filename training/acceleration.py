@@ -158,7 +158,7 @@ class GraphedTransfer:
         known = kind in graphs
         graph = graphs.pop(kind, None)
         if known and graph is None:
-            with torch.cuda.device(source.device), torch.inference_mode(False):
+            with torch.cuda.device(source.device), torch.inference_mode(False), torch.no_grad():
                 graph = _Graph(self._run, source, target)
         graphs[kind] = graph  # the latest is last
         while len(graphs) > self._kept:

@@ -26,7 +26,7 @@ class PoseTransfer:
 
     @classmethod
     def from_run(cls, run: str | Path, *, device: torch.device | str | None = None) -> "PoseTransfer":
-        """The network of a run folder, with its newest sound weights (CheckpointError where there are none).
+        """The network of a run folder, with the weights that are its result (CheckpointError where there are none).
 
         It runs on ``device``; by default on a GPU where there is one.
         """

@@ -64,7 +64,7 @@ def test_weights_without_a_journal_get_all_but_the_curve(
 
 def test_which_checkpoint_is_a_word_or_a_step() -> None:
     assert [which_checkpoint(word) for word in ("latest", "best", "2000")] == ["latest", "best", 2000]
-    with pytest.raises(argparse.ArgumentTypeError, match="'newest' is neither latest nor best nor a step"):
+    with pytest.raises(argparse.ArgumentTypeError, match="'newest' is none of result, latest, best, nor a step"):
         which_checkpoint("newest")
 
 

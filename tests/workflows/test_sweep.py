@@ -311,7 +311,7 @@ def test_a_stopped_trial_goes_on_from_its_checkpoint_and_ends_as_if_undisturbed(
     tmp_path: Path, tiny: str, dataset: str, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep = plan_sweep(recipe=tiny, shared=[], vary=["training.seed=1"])
-    looks = iter([False, False, True])
+    looks = iter([False, False, False, True])  # the first before any step
     with monkeypatch.context() as patched, pytest.raises(TrainingStopped, match="Run the same command again") as stop:
         patched.setattr(StopRequest, "made", lambda self: next(looks))
         run_sweep(sweep, out, Settings("tiny"), runner=here)

@@ -80,7 +80,8 @@ class FFAdaIN(nn.Module):
         if not self.fusion:
             size = (probe.shape[0], -1, -1)
             return affine_map(self.identity_scale).expand(size), affine_map(self.identity_shift).expand(size)
-        scale, shift = posed_map(self.mixed_scale, probe), posed_map(self.mixed_shift, probe)
+        with full_precision(probe):
+            scale, shift = posed_map(self.mixed_scale, probe), posed_map(self.mixed_shift, probe)
         if not self.target_side:
             return scale, shift
         scale = torch.lerp(affine_map(self.identity_scale), scale, self.alpha)
@@ -156,7 +157,8 @@ def rounded_modulated_relu(
     In inference under autocast on a CPU, features pass from one wide product to the next in the precision of the
     products: arrays of twice the size in between would take longer than the products themselves.
     """
-    if torch.is_grad_enabled() or hidden.dtype == vertices.dtype or hidden.device.type != "cpu":
+    plain = torch.is_grad_enabled() or torch.compiler.is_compiling()
+    if plain or hidden.dtype == vertices.dtype or hidden.device.type != "cpu":
         return centred_for_autocast(modulated_relu(hidden, vertices, scale, shift, room=room))
     with full_precision(hidden):
         return _rounded_modulated_relu(hidden, vertices, scale, shift, _usable(room, hidden))
