@@ -11,7 +11,7 @@ from typing import Any
 
 import zarr
 
-from datagen.store.schema import ManifestRow, attributes_of, list_objects, read_bytes
+from datagen.store.schema import ManifestRow, attributes_of, list_objects, read_bytes, require_group
 
 _ROOT, _MANIFEST = "zarr.json", "manifest/zarr.json"
 _SEAL = "attributes_sha256"
@@ -24,7 +24,7 @@ def commit(group: zarr.Group, rows: Sequence[ManifestRow], attributes: dict[str,
         "shards": [row.as_json() for row in ordered],
         "objects": {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)},
     }
-    group.require_group("manifest").update_attributes(content)
+    require_group(group, "manifest").update_attributes(content)
     stated = {**attributes_of(group), **attributes, "manifest_sha256": _digest(content)}
     group.update_attributes({**stated, _SEAL: _digest(_without_seal(stated))})
 

@@ -15,7 +15,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import zarr
@@ -231,6 +231,14 @@ def create_group(url: str, attributes: dict[str, Any]) -> zarr.Group:
             return zarr.create_group(plain(url), attributes=attributes, zarr_format=3)
     except ContainsGroupError:  # on a store without a lock, somebody else was first
         return open_group(url, mode="r+")
+
+
+def require_group(group: zarr.Group, path: str) -> zarr.Group:
+    """The group at a path, made if it is not there; on a store without a lock somebody else may be making it too."""
+    try:
+        return group.require_group(path)
+    except ContainsGroupError:  # made between Zarr's look and its making
+        return cast(zarr.Group, group[path])
 
 
 def _names_at(url: str) -> list[str]:

@@ -39,6 +39,7 @@ from datagen.store.schema import (
     list_objects,
     open_group,
     read_bytes,
+    require_group,
     shard_path,
     storage_errors,
     stored_sizes,
@@ -220,7 +221,7 @@ def committed_hashes(url: str) -> dict[str, str]:
 def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
     grid = Grid(recipe)
     for name in _GROUPS:
-        group.require_group(name)
+        require_group(group, name)
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
     for pose_type, triples in evaluation_lists(grid).items():
@@ -230,7 +231,7 @@ def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) ->
         parameters = identity_parameters(recipe, body, identity)
         faces = body.faces(parameters)
         topology = topologies.setdefault(faces.tobytes(), str(len(topologies)))
-        group.require_group(f"topology/{topology}")
+        require_group(group, f"topology/{topology}")
         _put(group, f"topology/{topology}/faces", faces, ("face", "corner"))
         one_pose = draw_poses(recipe.poses, grid.poses_of(identity)[:1])
         vertices = body.vertices(parameters, one_pose).shape[1]  # not faces.max() + 1: some vertices may be in no face
@@ -249,7 +250,7 @@ def _create_identity(
             create_vertices_array(group, path, rows=len(rows), codec=codec)
     elif array_at(group, path).shape[0] != len(rows):
         array_at(group, path).resize((len(rows), vertices, 3))
-    group.require_group(home).update_attributes({"topology": topology, "split": grid.split(identity)})
+    require_group(group, home).update_attributes({"topology": topology, "split": grid.split(identity)})
 
 
 def _put(group: zarr.Group, path: str, values: NDArray[Any], dimensions: tuple[str, ...]) -> None:
