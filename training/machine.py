@@ -14,6 +14,7 @@ from typing import Any
 import psutil
 
 from datagen.errors import StorageError
+from training.background import background
 from training.journal import Journal
 
 log = logging.getLogger(__name__)
@@ -24,14 +25,8 @@ _MIB = 1.048576  # megabytes in one, which nvidia-smi counts in
 @contextmanager
 def sampling(path: Path, *, every: float = 5.0) -> Iterator[None]:
     """Append this machine's load to the journal ``path`` while the block runs; failing to is no reason to stop it."""
-    stop = threading.Event()
-    thread = threading.Thread(target=_sample, args=(path, stop, every), name="machine-load", daemon=True)
-    thread.start()
-    try:
+    with background(lambda stop: _sample(path, stop, every), name="machine-load"):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 class MachineLoad:

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from training.background import background
 from training.journal import journal_from
 from training.machine import sampling
 from training.progress import Progress
@@ -59,14 +60,8 @@ def following(journal: Path, *, steps: int, steps_per_epoch: int | None = None) 
     What the journal holds already is the past: it is shown, but the time left comes from what is added.
     """
     follower = _Follower(journal, Progress(steps=steps, steps_per_epoch=steps_per_epoch), steps)
-    stop = threading.Event()
-    thread = threading.Thread(target=follower.run, args=(stop,), name="progress", daemon=True)
-    thread.start()
-    try:
+    with background(follower.run, name="progress"):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 class _Follower:
