@@ -19,7 +19,7 @@ from typing import Any
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
 from training.ranks import STOP_FILE, Ranks, TrainingError, TrainingStopped, device_of
-from training.recipe import TrainingRecipe, budget_seconds
+from training.recipe import TrainingRecipe
 from training.recipe_file import recipe_in
 from training.trainer import train
 
@@ -50,9 +50,6 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
 
 
 def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
-    from ray.train import FailureConfig, RunConfig, ScalingConfig
-    from ray.train.torch import TorchConfig, TorchTrainer
-
     began, gpu = time.time(), _on_gpus(recipe)
     if not gpu:
         recipe = recipe.model_copy(update={"device": "cpu"})
@@ -64,24 +61,10 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
         (run / left_over).unlink(missing_ok=True)
     mark = uuid.uuid4().hex
     write_atomically(run / _MARK, mark.encode())
-    trainer = TorchTrainer(
-        _rank,
-        train_loop_config={
-            "recipe": recipe.model_dump(mode="json"),
-            "data": data,
-            "run": str(run),
-            "mark": mark,
-            "began": began,
-        },
-        torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
-        scaling_config=ScalingConfig(num_workers=_workers(recipe), use_gpu=gpu),
-        run_config=RunConfig(
-            name="ray", storage_path=str(run.resolve()), failure_config=FailureConfig(max_failures=_RESTARTS)
-        ),
-    )
+    told = {"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark, "began": began}
     try:
         with _passing_on_sigterm(run):
-            _fit(trainer.fit, run)
+            _fit(_group(recipe, told, gpu=gpu).fit, run)
     except DsffnetError:
         raise
     except Exception as error:
@@ -93,6 +76,21 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     failure = _failure_of(run)
     if failure:
         raise failure
+
+
+def _group(recipe: TrainingRecipe, told: dict[str, Any], *, gpu: bool) -> Any:
+    """Ray's trainer of a group of ranks that are each told the same."""
+    from ray.train import FailureConfig, RunConfig, ScalingConfig
+    from ray.train.torch import TorchConfig, TorchTrainer
+
+    storage = str(Path(told["run"]).resolve())
+    return TorchTrainer(
+        _rank,
+        train_loop_config=told,
+        torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
+        scaling_config=ScalingConfig(num_workers=_workers(recipe), use_gpu=gpu),
+        run_config=RunConfig(name="ray", storage_path=storage, failure_config=FailureConfig(max_failures=_RESTARTS)),
+    )
 
 
 def _fit(fit: Callable[[], object], run: Path) -> None:
@@ -135,21 +133,13 @@ def _rank(config: dict[str, Any]) -> None:
     try:
         if not (run / _MARK).exists() or (run / _MARK).read_text() != config["mark"]:
             raise TrainingError(f"this rank does not see {run} as the driver does: --out must be on a disk they share")
-        recipe = _with_what_is_left(TrainingRecipe.model_validate(config["recipe"]), began=config["began"])
-        train(recipe, data=config["data"], run=run)
+        recipe = TrainingRecipe.model_validate(config["recipe"])
+        train(recipe, data=config["data"], run=run, began=config["began"])
     except DsffnetError as error:
         if not (getattr(error, "secondary", False) and (run / _FAILURE).exists()):
             about = {"message": str(error), "status": error.exit_status, "stopped": isinstance(error, TrainingStopped)}
             write_atomically(run / _FAILURE, json.dumps(about).encode())
         raise
-
-
-def _with_what_is_left(recipe: TrainingRecipe, *, began: float) -> TrainingRecipe:
-    """The recipe with what is left of its time budget since ``began`` (seconds since 1970), a second at least."""
-    if recipe.budget is None:
-        return recipe
-    left = max(1.0, budget_seconds(recipe.budget) - max(0.0, time.time() - began))
-    return recipe.model_copy(update={"budget": f"{left:.0f}s"})
 
 
 def _failure_of(run: Path) -> TrainingError | None:

@@ -48,7 +48,7 @@ from training.ranks import (
 from training.recipe import TrainingRecipe, budget_seconds
 from training.resume import checkpoint_to_go_on_from, weights_to_begin_from
 from training.snapshots import snapshot_path
-from training.triples import TripleOrder
+from training.triples import last_step_of, order_of
 
 log = logging.getLogger(__name__)
 _CHECK_EVERY = {"cpu": 1, "cuda": 16}
@@ -57,7 +57,7 @@ _SAY_EVERY = 20.0
 """Seconds between lines of the log."""
 
 
-def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
+def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None = None) -> int:
     """Train until the recipe's last step, from the newest sound checkpoint of ``run`` if there is one.
 
     Parameters
@@ -68,6 +68,8 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
         Store URL of a complete dataset.
     run
         Folder of the run; rank 0 writes to it.
+    began
+        When the command began that the recipe's time budget counts from, in seconds since 1970; default: now.
 
     Returns
     -------
@@ -83,7 +85,7 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
     TrainingError, DatasetError, CheckpointError, StorageError
         See their messages; the last good checkpoint is kept.
     """
-    began, now = time.monotonic(), time.time()
+    now = time.time()
     ranks = Ranks.from_environment()
     device = device_of(recipe, ranks)
     launched = dist.is_initialized()  # by Ray Train, whose driver keeps RUN/stop
@@ -93,18 +95,11 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path) -> int:
         with StopRequest(run) as stop:
             dataset = agreed(ranks, lambda: open_dataset(data), what="open the dataset")
             found = checkpoint_to_go_on_from(recipe, dataset, run, ranks)
-            if found and is_finished(found, _order(recipe, dataset)[1]):
+            if found and is_finished(found, last_step_of(recipe, dataset)):
                 return found.step
             require_measurable(dataset, recipe)
             # The trainer must be gone before its process group is: see tests/training/one_rank.py.
-            return _Trainer(recipe, dataset, run, ranks, device, stop, began, found).run()
-
-
-def _order(recipe: TrainingRecipe, dataset: Dataset) -> tuple[TripleOrder, int]:
-    """The order of triples, and the step at which training ends."""
-    identities = dataset.identities("training")
-    order = TripleOrder(identities, dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
-    return order, order.last_step(recipe.epochs, recipe.steps)
+            return _Trainer(recipe, dataset, run, ranks, device, stop, began or now, found).run()
 
 
 class _Trainer:
@@ -121,7 +116,7 @@ class _Trainer:
     ) -> None:
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
         self.device, self._stop, self._began = device, stop, began
-        self.order, self.last_step = _order(recipe, dataset)
+        self.order, self.last_step = order_of(recipe, dataset), last_step_of(recipe, dataset)
         start = None if found else weights_to_begin_from(recipe, ranks)
         self.learner = Learner(
             recipe, ranks, device, steps_per_epoch=self.order.steps_per_epoch, steps=self.last_step, start=start
@@ -219,7 +214,7 @@ class _Trainer:
 
     def _spent(self) -> bool:
         budget = self.recipe.budget
-        return budget is not None and time.monotonic() - self._began > budget_seconds(budget)
+        return budget is not None and time.time() - self._began > budget_seconds(budget)
 
     def _log(self, values: dict[str, Any], probing: bool) -> None:
         shared = mean_over_ranks(values, self.ranks)

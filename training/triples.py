@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from datagen.errors import DatasetError, RecipeError
 from datagen.random import Stream, generator
+from datagen.store import Dataset
+from training.recipe import TrainingRecipe
 
 Triples = NDArray[np.integer]
 """Rows [triple, 4] of (source identity, source pose, target identity, target pose)."""
@@ -28,6 +30,22 @@ def epoch_triples(*, identities: int, poses: int, seed: int, epoch: int) -> NDAr
     source = (target + random.integers(1, identities, len(target))) % identities
     target_pose = (source_pose + random.integers(1, poses, len(target))) % poses
     return np.stack([source, source_pose, target, target_pose], axis=1)
+
+
+def order_of(recipe: TrainingRecipe, dataset: Dataset) -> "TripleOrder":
+    """The order of triples of a training by this recipe on this dataset: training identities in seen poses.
+
+    Raises
+    ------
+    DatasetError
+        See :class:`TripleOrder`.
+    """
+    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
+
+
+def last_step_of(recipe: TrainingRecipe, dataset: Dataset) -> int:
+    """The step at which a training of this recipe on this dataset ends, unless early stopping ends it before."""
+    return recipe.steps or recipe.epochs * order_of(recipe, dataset).steps_per_epoch
 
 
 @dataclass(frozen=True)
@@ -65,10 +83,6 @@ class TripleOrder:
     def steps_per_epoch(self) -> int:
         """Whole batches of an epoch."""
         return self.cells // self.batch
-
-    def last_step(self, epochs: int, steps: int | None = None) -> int:
-        """The step at which a training of so many epochs ends, or of so many steps where they are given."""
-        return steps or epochs * self.steps_per_epoch
 
     def batches(self, *, first_step: int, rank: int = 0, ranks: int = 1, parts: int = 1) -> Iterator[list[Triples]]:
         """This rank's share of every batch from ``first_step`` on, without end: ``parts`` arrays [triple, 4].

@@ -29,7 +29,7 @@ from training.recipe import EvaluationRecipe, TrainingRecipe
 from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
-from training.triples import TripleOrder
+from training.triples import last_step_of, order_of
 from workflows.console import alone_in
 from workflows.evaluated import evaluated
 from workflows.progress import bar, following, sampling
@@ -90,9 +90,8 @@ def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     artifacts = ["recipe.yaml", "provenance.json"]
     update_record(run, dataset=about_dataset(dataset), artifacts=artifacts)
     write_run_head(recipe, dataset, run)
-    order = order_of(recipe, dataset)
-    steps = order.last_step(recipe.epochs, recipe.steps)
-    with following(run / "metrics.jsonl", steps=steps, steps_per_epoch=order.steps_per_epoch):
+    steps, per_epoch = last_step_of(recipe, dataset), order_of(recipe, dataset).steps_per_epoch
+    with following(run / "metrics.jsonl", steps=steps, steps_per_epoch=per_epoch):
         launch(recipe, data=dataset.url, run=run)
     _say_where_meshes_were(run)
     reached = require_checkpoint(run)
@@ -177,16 +176,6 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> No
     recipe.require_same_learning(recipe_of(found), where=str(run))
 
 
-def order_of(recipe: TrainingRecipe, dataset: Dataset) -> TripleOrder:
-    """The order of triples of a training on a dataset."""
-    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
-
-
-def last_step(recipe: TrainingRecipe, dataset: Dataset) -> int:
-    """The step at which a training of this recipe on this dataset ends, unless early stopping ends it before."""
-    return order_of(recipe, dataset).last_step(recipe.epochs, recipe.steps)
-
-
 def is_complete(data: str) -> bool:
     """Whether a complete dataset is there, none of its shards missing."""
     try:
@@ -201,7 +190,7 @@ def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
     try:
         dataset, found = open_dataset(data), load_checkpoint(run)
         check_run_accepts(recipe, dataset, run)
-        return found is not None and is_finished(found, last_step(recipe, dataset))
+        return found is not None and is_finished(found, last_step_of(recipe, dataset))
     except DsffnetError:
         return False
 

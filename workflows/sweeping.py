@@ -14,9 +14,10 @@ from datagen.store.schema import open_group
 from training.ranks import TrainingStopped
 from training.record import read_record, update_record
 from training.sweep_figures import PMD_UNIT
+from training.triples import last_step_of
 from workflows.cluster import ray_cluster
 from workflows.console import WorkflowError, start_over
-from workflows.pipeline import check_run_accepts, generate_stage, is_complete, last_step, recorded
+from workflows.pipeline import check_run_accepts, generate_stage, is_complete, recorded
 from workflows.recipe import save_recipe
 from workflows.stages import Stage, run_stage, say
 from workflows.sweep_progress import SweepProgress
@@ -92,7 +93,7 @@ def run_sweep(
 def _run_trials(sweep: Sweep, place: Place, settings: Settings, running: Trials) -> list[Outcome]:
     """Follow trials until all have ended; the report is brought up to date whenever one does."""
     dataset, outcomes = open_dataset(place.data), []
-    steps = {trial.name: last_step(trial.training, dataset) for trial in sweep.trials}
+    steps = {trial.name: last_step_of(trial.training, dataset) for trial in sweep.trials}
     with closing(running), SweepProgress(sweep.trials, steps, place.out) as progress:
         for outcome in running:
             if outcome is not None:

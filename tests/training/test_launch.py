@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from tests.support.ranks import ROOT
 from tests.support.recipes import tiny_training
 from training import launch
 from training.checkpoint import require_checkpoint
-from training.ranks import STOP_FILE, TrainingError
+from training.ranks import STOP_FILE, BudgetSpent, TrainingError
 from training.recipe_file import recipe_in
 
 
@@ -52,12 +53,19 @@ def test_without_progress_or_told_to_stop_or_with_something_to_mend_it_ends(
     assert fit.calls == (2 if left_over is None else 1)
 
 
-def test_the_budget_counts_from_the_drivers_start() -> None:
-    recipe = tiny_training(budget="10min")
-    assert launch._with_what_is_left(recipe, began=time.time() - 240).budget in ("360s", "359s")
-    assert launch._with_what_is_left(recipe, began=time.time() - 6000).budget == "1s"
-    assert launch._with_what_is_left(recipe, began=time.time() + 60).budget == "600s", "clocks differ"
-    assert launch._with_what_is_left(tiny_training(), began=0.0).budget is None
+@pytest.mark.parametrize(
+    ("ago", "steps"), [(300, 8), (6000, 1), (-60, 8)], ids=["half spent", "spent", "clocks differ"]
+)
+def test_the_budget_counts_from_the_drivers_start(dataset: str, tmp_path: Path, ago: float, steps: int) -> None:
+    """Restarts included; and a group that comes too late still learns a step."""
+    recipe, run = tiny_training(budget="10min"), tmp_path / "run"
+    config = {"recipe": recipe.model_dump(mode="json"), "data": dataset, "run": str(run), "mark": "its"}
+    run.mkdir()
+    (run / ".launch").write_text("its")
+    late = pytest.raises(BudgetSpent, match="budget of 10min is spent at step 1 of 8") if steps == 1 else nullcontext()
+    with late:
+        launch._rank(config | {"began": time.time() - ago})
+    assert require_checkpoint(run).step == steps
 
 
 @pytest.mark.parametrize(
