@@ -10,7 +10,7 @@ without a checkpoint, so that this average is neither kept nor evaluated.)
 
 import contextlib
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -77,7 +77,7 @@ class Learner:
         self.optimiser.zero_grad(set_to_none=True)
         meshes = sum(len(part.source) for part in parts)
         found: dict[str, Tensor] = {}
-        with self._spectral_norms():
+        with products(self.recipe.precision), iterated_once(self.network):
             for number, part in enumerate(parts):
                 weight = share * len(part.source) / meshes
                 for name, value in self._backward(part, weight, last=number == len(parts) - 1).items():
@@ -119,7 +119,7 @@ class Learner:
 
     def _backward(self, batch: Batch, weight: float, *, last: bool) -> dict[str, Tensor]:
         batch = batch.in_dtype(self.dtype)
-        with self._in_step_with_others(last), products(self.recipe.precision):
+        with self._in_step_with_others(last):
             with autocast(self.recipe.precision, self._device):
                 prediction = self._predict(batch)
             loss, parts = transfer_loss(
@@ -150,11 +150,6 @@ class Learner:
         """
         model = MixedCounts(compiled(self.network, self._device) if self.recipe.compile else self.network)
         return DistributedDataParallel(model) if self._ranks.count > 1 else model
-
-    @contextlib.contextmanager
-    def _spectral_norms(self) -> Iterator[None]:
-        with products(self.recipe.precision), iterated_once(self.network):
-            yield
 
     def _in_step_with_others(self, last: bool) -> contextlib.AbstractContextManager[Any]:
         """Gradients are averaged over ranks once, in the last part's backward pass."""
