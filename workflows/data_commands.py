@@ -4,15 +4,21 @@ import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from datagen.errors import DatasetError, RecipeError
-from datagen.exporters import ExportLayout
-from datagen.layouts import Layout
-from datagen.recipe import PATH_KEYS, AnnyTopology, DatasetRecipe
-from datagen.standins import Kind
-from workflows.commands import add_command, print_facts
-from workflows.console import add_recipe_options, add_set_option
+from datagen.recipe import PATH_KEYS, DatasetRecipe
+from workflows.commands import Command, add_command, print_facts
+from workflows.data_arguments import (
+    declare_append,
+    declare_convert,
+    declare_export,
+    declare_generate,
+    declare_import,
+    declare_inspect,
+    declare_stand_in,
+    declare_verify,
+)
 from workflows.recipe import change_recipe, load_recipe, override_values, recipe_faults, with_absolute_paths
 
 
@@ -180,7 +186,7 @@ def _show(url: str) -> None:
     print_facts(describe(url))
 
 
-_EXAMPLES = {
+_EXAMPLES: dict[Command, str] = {
     generate_command: """\
   dsffnet generate --recipe quickstart --out data/quickstart.zarr
   dsffnet generate --recipe quickstart --set data.identities.seed=7 --out data/custom.zarr
@@ -210,63 +216,15 @@ _EXAMPLES = {
 
 def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Declare them all."""
-    generate = add_command(commands, generate_command, _EXAMPLES[generate_command], takes_recipe=True)
-    add_recipe_options(generate)
-    _add_making(generate)
-    generate.add_argument("--fresh", action="store_true", help="remove what is there first")
 
-    append = add_command(commands, append_command, _EXAMPLES[append_command])
-    append.add_argument("out", metavar="X.zarr", help="a complete dataset")
-    for name, what in (
-        ("training", "training identities"),
-        ("evaluation", "evaluation identities"),
-        ("seen", "poses that occur in training"),
-        ("unseen", "poses kept for evaluation"),
-    ):
-        append.add_argument(f"--{name}", type=int, metavar="TOTAL", help=f"{what}, with those that are there")
-    append.add_argument("--local", action="store_true", help="in this process, without Ray")
-    add_set_option(append)
+    def declared(command: Command, **options: bool) -> argparse.ArgumentParser:
+        return add_command(commands, command, _EXAMPLES[command], **options)
 
-    inspect = add_command(commands, inspect_command, _EXAMPLES[inspect_command])
-    inspect.add_argument("dataset", metavar="X.zarr")
-    inspect.add_argument("--picture", metavar="PNG", help="where the picture goes; none: no picture")
-
-    verify = add_command(commands, verify_command, _EXAMPLES[verify_command])
-    verify.add_argument("dataset", metavar="X.zarr")
-    verify.add_argument("--repair", action="store_true", help="make faulty or missing shards again")
-    add_set_option(verify)
-
-    take = add_command(commands, import_command, _EXAMPLES[import_command])
-    take.add_argument("layout", choices=get_args(Layout), help="how the files lie (docs/importing.md)")
-    take.add_argument("folder", metavar="FOLDER", help="where they are")
-    _add_making(take)
-    take.add_argument("--fresh", action="store_true", help="remove what is there first")
-    add_set_option(take)
-
-    export = add_command(commands, export_command, _EXAMPLES[export_command])
-    export.add_argument("dataset", metavar="X.zarr")
-    export.add_argument("--layout", choices=get_args(ExportLayout), required=True, help="see docs/importing.md")
-    export.add_argument("--out", required=True, metavar="FOLDER", help="where the files go")
-    export.add_argument("--identities", type=int, nargs="+", metavar="I", help="these only")
-    export.add_argument("--poses", type=int, nargs="+", metavar="P", help="these only")
-    export.add_argument("--prefix", default="", help="before the numbers in npt-*: id or toy_ for 3D-CoreNet's loaders")
-    export.add_argument("--fresh", action="store_true", help="write files anew that are there")
-
-    convert = add_command(commands, convert_body_command, _EXAMPLES[convert_body_command])
-    convert.add_argument("model", metavar="MODEL", help="the file that came with your licence (.pkl or .npz)")
-    convert.add_argument("--out", required=True, metavar="X.npz", help="where the arrays go")
-
-    stand_in = add_command(commands, stand_in_command, _EXAMPLES[stand_in_command])
-    stand_in.add_argument("kind", choices=get_args(Kind), help="whose layout")
-    stand_in.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
-    stand_in.add_argument(
-        "--topology",
-        default="notoes_collapse10pc",
-        choices=get_args(AnnyTopology),
-        help="of the Anny body it is made from",
-    )
-
-
-def _add_making(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", required=True, metavar="X.zarr", help="where the dataset goes (folder or store URL)")
-    parser.add_argument("--local", action="store_true", help="in this process, without Ray")
+    declare_generate(declared(generate_command, takes_recipe=True))
+    declare_append(declared(append_command))
+    declare_inspect(declared(inspect_command))
+    declare_verify(declared(verify_command))
+    declare_import(declared(import_command))
+    declare_export(declared(export_command))
+    declare_convert(declared(convert_body_command))
+    declare_stand_in(declared(stand_in_command))
