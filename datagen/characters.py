@@ -21,6 +21,7 @@ from datagen.joint_names import pairs
 from datagen.joint_trees import Tree, joint_tree
 from datagen.keyframes import Clip, read_clips, world_frames
 from datagen.mesh import Mesh, check_mesh
+from datagen.simplification import simplify
 from datagen.skins import Skin, one_skin
 from datagen.surfaces import volume, weld
 
@@ -70,8 +71,10 @@ class Character:
         return _rotations(self.turn @ frames @ self.unbind)
 
 
-def load_characters(path: str, chosen: Sequence[str] = ()) -> list[Character]:
+def load_characters(path: str, chosen: Sequence[str] = (), *, vertices: int | None = None) -> list[Character]:
     """The characters of a folder, or the CC0 animals, in alphabetical order; ``chosen`` are names, in their own order.
+
+    ``vertices``: simplified to about so many (:func:`datagen.simplification.simplify`).
 
     Raises
     ------
@@ -84,7 +87,8 @@ def load_characters(path: str, chosen: Sequence[str] = ()) -> list[Character]:
     unknown = [name for name in chosen if name not in files]
     if unknown:
         raise RecipeError(f"no character {unknown[0]!r} among {path}; there are {', '.join(files)}")
-    return [load_character(files[name]) for name in chosen or files]
+    found = [load_character(files[name]) for name in chosen or files]
+    return [_simplified(each, vertices) for each in found] if vertices else found
 
 
 def shared_joints(characters: Sequence[Character]) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -120,6 +124,14 @@ def load_character(path: Path) -> Character:
     """
     with reading(path):
         return _character(Gltf(path))
+
+
+@lru_cache(maxsize=64)
+def _simplified(character: Character, count: int) -> Character:
+    surface = character.vertices, character.faces, character.weights
+    vertices, faces, weights = simplify(*surface, count, name=str(character.path))
+    check_mesh(Mesh(vertices, faces), name=f"{character.path}, simplified to {count:,} vertices")
+    return replace(character, vertices=vertices, faces=faces, weights=weights)
 
 
 def _character(file: Gltf) -> Character:

@@ -130,7 +130,8 @@ class DatasetRecipe(Frozen):
     def identifying(self) -> dict[str, Any]:
         """The recipe as plain data, without the paths of asset files: where a file lies does not change its bytes.
 
-        What those files hold does; their hashes are compared apart (:class:`datagen.bodies.Asset`).
+        What those files hold does; their hashes are compared apart (:class:`datagen.bodies.Asset`). Keys that came
+        later than datasets are left out where they mean what those were made by.
         """
         return _without_paths(self.model_dump(mode="json"))
 
@@ -147,7 +148,12 @@ ANIMALS = "animals"
 """In the place of a path: the twelve CC0 animals."""
 
 
+_LATER = [("vertices", None)]
+"""Keys younger than some datasets, with the value that stands for how those were made."""
+
+
 def _without_paths(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_paths(inner) for key, inner in value.items() if key not in PATH_KEYS}
+        kept = {key: inner for key, inner in value.items() if key not in PATH_KEYS and (key, inner) not in _LATER}
+        return {key: _without_paths(inner) for key, inner in kept.items()}
     return [_without_paths(inner) for inner in value] if isinstance(value, list) else value

@@ -113,6 +113,9 @@ class RiggedBody(Frozen):
     height: float = Field(
         0.0, ge=0, description="metres from feet to highest point at rest, before parts are scaled; 0: as in the file"
     )
+    vertices: int | None = Field(
+        None, ge=50, description="simplify each character to about so many vertices; default: all, as in the file"
+    )
 
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]

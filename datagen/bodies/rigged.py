@@ -31,7 +31,7 @@ class RiggedModel:
     """
 
     def __init__(self, recipe: RiggedBody) -> None:
-        self._characters = load_characters(recipe.path, recipe.characters)
+        self._characters = load_characters(recipe.path, recipe.characters, vertices=recipe.vertices)
         self._stretchable = [Stretchable(character) for character in self._characters]
         found = {part for each in self._stretchable for part in each.parts}
         self.parameter_names = (

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from datagen.bodies import load_body
 from datagen.bodies.rigged import RiggedModel, part_scales
@@ -13,7 +14,8 @@ from datagen.errors import BodyError, RecipeError
 from datagen.mesh import Mesh, check_mesh, edges_of
 from datagen.poses import Poses
 from datagen.random import Stream, generator
-from datagen.recipe import RiggedBody
+from datagen.recipe import DatasetRecipe, RiggedBody
+from datagen.simplification import simplify
 from datagen.surfaces import volume
 from tests.support.real_animals import require_animals
 from tests.support.rigged_files import BOXES, JOINTS, Floats, Rig
@@ -209,3 +211,35 @@ def length(vertices: Floats, edges: np.ndarray) -> Floats:
 def normals(vertices: Floats, faces: np.ndarray) -> Floats:
     corners = vertices[faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def test_simplified_animals_keep_their_volume_and_are_posed_like_the_whole_ones() -> None:
+    path = str(require_animals())
+    whole, coarse = (RiggedModel(RiggedBody(path=path, vertices=count)) for count in (None, 300))
+    for number in range(12):
+        parameters = identity(whole, number)
+        assert np.array_equal(parameters, identity(coarse, number)), "the same identities"
+        assert coarse.vertices(parameters, REST).shape[1] <= 330 < whole.vertices(parameters, REST).shape[1]
+        volumes = [volume(body.vertices(parameters, REST)[0], body.faces(parameters)) for body in (whole, coarse)]
+        assert volumes[1] == pytest.approx(volumes[0], rel=0.05)
+    parameters, bent = identity(whole, 3), Poses(whole.joints[:1], (-1,), np.array([[[0.0, 0.7, 0.0]]]))
+    fine, few = (body.vertices(parameters, bent)[0] for body in (whole, coarse))
+    distance = np.linalg.norm(few[:, None] - fine[None], axis=2).min(axis=1)
+    assert distance.max() < 0.05 * np.ptp(fine, axis=0).max()
+
+
+def test_a_surface_whose_parts_would_vanish_is_refused() -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    sides = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)
+    vertices = np.concatenate([corners + 3 * number for number in range(100)])
+    faces = np.concatenate([sides + 4 * number for number in range(100)])
+    weights = scipy.sparse.csr_array(np.ones((400, 1)))
+    with pytest.raises(BodyError, match=r"cloud.glb: 400 vertices cannot be simplified to 50, only to \d+"):
+        simplify(vertices, faces, weights, 50, name="cloud.glb")
+
+
+def test_a_recipe_without_the_number_of_vertices_means_what_it_meant() -> None:
+    made = DatasetRecipe.model_validate({"body": {"family": "rigged"}})
+    assert "vertices" in made.model_dump()["body"] and "vertices" not in made.identifying()["body"]
+    fewer = DatasetRecipe.model_validate({"body": {"family": "rigged", "vertices": 300}})
+    assert fewer.sha256() != made.sha256()
