@@ -1,7 +1,8 @@
 """Random changes of a training batch: another subset of the source's vertices each time, and noise on them.
 
-The paper trains without. Shuffling vertices would change nothing (the networks are invariant to the source's order and
-equivariant to the target's); subsets and noise do.
+The paper trains without. Shuffling vertices changes nothing for DSFFNet and NPT, which are invariant to the source's
+order and equivariant to the target's. The generator of 3D-CoreNet has a kernel of three along the list of the target's
+vertices: it learns from the order that a body model happens to list them in, unless they are shuffled.
 """
 
 from dataclasses import replace
@@ -55,6 +56,38 @@ class Augmentation:
         if self._noise:
             mesh = mesh + self._noise * torch.randn(mesh.shape, generator=random, device=mesh.device)
         return mesh
+
+
+class Shuffle:
+    """Another order of the target's vertices at each step, undone in what comes out.
+
+    Meshes of one vertex count share an order, a function of (seed, step, count).
+    """
+
+    def __init__(self, batch: Batch, *, seed: int, step: int) -> None:
+        rows = batch.target.shape[1]
+        orders = {
+            count: torch.cat([_order(seed, step, count), torch.arange(count, rows)])
+            for count in set(batch.target_counts or (rows,))
+        }
+        counts = batch.target_counts or (rows,) * len(batch)
+        self._index = torch.stack([orders[count] for count in counts]).to(batch.target.device)[..., None]
+
+    def __call__(self, vertices: Tensor) -> Tensor:
+        """Vertices [b, n, 3] in the new order."""
+        return vertices.gather(1, self._index.expand(vertices.shape))
+
+    def undone(self, vertices: Tensor) -> Tensor:
+        """Vertices [b, n, 3] in their own order again."""
+        return torch.zeros_like(vertices).scatter(1, self._index.expand(vertices.shape), vertices)
+
+
+def _order(seed: int, step: int, count: int) -> Tensor:
+    random = _generator(seed, step, _SHUFFLED - count, torch.device("cpu"))
+    return torch.randperm(count, generator=random)
+
+
+_SHUFFLED = 2**63  # less a vertex count: no place of a triple in a batch
 
 
 def _generator(seed: int, step: int, place: int, device: torch.device) -> torch.Generator:

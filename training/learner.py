@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from training.acceleration import autocast, compiled, products
+from training.augmentation import Shuffle
 from training.batches import Batch
 from training.checkpoint import Checkpoint
 from training.inference import load_weights, network_from
@@ -134,12 +135,14 @@ class Learner:
         return {**parts, "total": loss.detach()}
 
     def _predict(self, batch: Batch) -> Tensor:
-        found: Tensor = self.model(
-            source=batch.source,
-            target=batch.target,
-            source_counts=batch.source_counts,
-            target_counts=batch.target_counts,
-        )
+        if not self.recipe.augmentation.shuffle:
+            return self._output(batch, batch.target)
+        shuffle = Shuffle(batch, seed=self.recipe.seed, step=self.schedule.done)
+        return shuffle.undone(self._output(batch, shuffle(batch.target)))
+
+    def _output(self, batch: Batch, target: Tensor) -> Tensor:
+        counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
+        found: Tensor = self.model(source=batch.source, target=target, **counts)
         return found
 
     @functools.cached_property

@@ -97,6 +97,11 @@ class AugmentationRecipe(Frozen):
     source_noise: float = Field(
         0.0, ge=0, le=0.5, description="standard deviation of noise on source vertices, half the longest box edge = 1"
     )
+    shuffle: bool = Field(
+        False,
+        description="the network sees the target's vertices in another order at each step (3D-CoreNet's authors do, "
+        "as its generator reads neighbours in the list); changes nothing for DSFFNet and NPT",
+    )
 
 
 class TrainingRecipe(Frozen):
@@ -192,6 +197,11 @@ class TrainingRecipe(Frozen):
             raise ValueError(
                 f"network.variant 'origin' pairs source and target by index, but augmentation.vertices {kept} "
                 "leaves vertices out: set augmentation.vertices to 1, or network.variant to maxpool"
+            )
+        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and self.augmentation.shuffle:
+            raise ValueError(
+                "network.variant 'origin' pairs source and target by index, but augmentation.shuffle is true: "
+                "set augmentation.shuffle to false, or network.variant to maxpool"
             )
         if self.early_stopping and self.steps and self.evaluate_every >= self.steps:
             raise ValueError(

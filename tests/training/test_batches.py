@@ -12,7 +12,7 @@ from datagen.mesh import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from tests.support.mixed import MIXED_COUNTS, mixed_dataset
 from tests.support.recipes import tiny_training
-from training.augmentation import Augmentation
+from training.augmentation import Augmentation, Shuffle
 from training.banks import open_bank
 from training.batches import Batch, EdgeTable, PackedEdges, read_batch
 from training.incidence import INCIDENCES, incidence_of, make_incidence
@@ -195,3 +195,16 @@ def test_noise_has_its_deviation_and_changes_from_step_to_step(mixed: Dataset) -
 def test_without_augmentation_the_batch_is_left_alone(mixed: Dataset) -> None:
     batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
     assert Augmentation(tiny_training())(batch, step=0, first=0) is batch
+
+
+def test_a_shuffled_batch_lists_each_targets_own_vertices_in_another_order_and_back(mixed: Dataset) -> None:
+    batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    assert batch.target_counts is not None
+    shuffle, later = (Shuffle(batch, seed=1, step=step) for step in (5, 6))
+    shuffled = shuffle(batch.target)
+    for mesh, other, count in zip(batch.target, shuffled, batch.target_counts, strict=True):
+        assert not torch.equal(mesh[:count], other[:count]) and torch.equal(mesh[count:], other[count:])
+        assert sorted(map(tuple, mesh[:count].tolist())) == sorted(map(tuple, other[:count].tolist()))
+    assert torch.equal(shuffle.undone(shuffled), batch.target)
+    assert not torch.equal(later(batch.target), shuffled), "another order at each step"
+    assert torch.equal(Shuffle(batch, seed=1, step=5)(batch.target), shuffled), "the same order for every rank and part"

@@ -102,6 +102,18 @@ def test_augmented_training_resumes_to_the_bit(dataset: str, tmp_path: Path) -> 
     assert same_bits(tmp_path / "stopped", tmp_path / "whole")
 
 
+@pytest.mark.parametrize("name, differs", [("dsffnet", False), ("npt", False), ("corenet3d", True)])
+def test_the_order_of_vertices_matters_to_3d_corenet_alone(
+    dataset: str, tmp_path: Path, name: str, differs: bool
+) -> None:
+    """Its generator has a kernel of three along the list of vertices."""
+    given = {"network": NETWORKS[name], "precision": "float64"}
+    train(tiny_training(**given), data=dataset, run=tmp_path / "listed")
+    train(tiny_training(**given, augmentation={"shuffle": True}), data=dataset, run=tmp_path / "shuffled")
+    same = torch.allclose(losses(tmp_path / "listed"), losses(tmp_path / "shuffled"), rtol=1e-9, atol=0)
+    assert same != differs
+
+
 def test_averaged_weights_resume_to_the_bit_and_are_what_is_evaluated(dataset: str, tmp_path: Path) -> None:
     whole, stopped, raw = (tmp_path / name for name in ("whole", "stopped", "raw"))
     train(tiny_training(average=0.9), data=dataset, run=whole)

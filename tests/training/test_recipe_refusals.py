@@ -18,6 +18,10 @@ ORIGIN = {"name": "npt", "variant": "origin"}
             "'origin' pairs source and target by index, but augmentation.vertices 0.5 .*set augmentation.vertices to 1",
         ),
         (
+            {"network": ORIGIN, "augmentation": {"shuffle": True}},
+            "'origin' pairs source and target by index, but augmentation.shuffle is true: set augmentation.shuffle to",
+        ),
+        (
             {"early_stopping": 3, "steps": 400},
             "with evaluate_every 500 there is none before the last of 400 steps: set evaluate_every lower",
         ),

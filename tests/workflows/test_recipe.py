@@ -110,6 +110,7 @@ def test_published_trainings_are_what_their_sources_say() -> None:
     assert (npt.edge_reference, npt.edge_sum, npt.weight_decay) == ("target", "faces", 0)
     assert (corenet.optimiser, corenet.betas, corenet.epsilon, corenet.learning_rate) == ("adam", (0, 0.9), 1e-3, 1e-4)
     assert (corenet.schedule.name, corenet.schedule.hold, corenet.edge_weight) == ("linear", 0.5, 0.5)
+    assert corenet.augmentation.shuffle
     # 1,000 times the mean over coordinates is a third of that times the mean over vertices
     assert corenet.reconstruction_weight * 3 == pytest.approx(1000) and npt.reconstruction_weight * 3 == pytest.approx(
         1
