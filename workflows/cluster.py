@@ -2,11 +2,14 @@
 
 import logging
 import os
+import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from datagen.errors import ClusterError, RecipeError
 
@@ -57,6 +60,7 @@ def ray_cluster() -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
+    before = signal.getsignal(signal.SIGTERM)
     if on_cluster():
         _require_head()
         ray.init(logging_level=logging.WARNING)
@@ -71,9 +75,23 @@ def ray_cluster() -> Iterator[None]:
             runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
         )
     try:
-        yield
+        with _with_handler(before):
+            yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def _with_handler(before: Any) -> Iterator[None]:
+    """Heed SIGTERM as before Ray was started, which lets it abort this process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    rays = signal.signal(signal.SIGTERM, before)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, rays)
 
 
 def _require_head() -> None:

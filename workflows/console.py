@@ -7,6 +7,7 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,19 +48,27 @@ def guarded(main: Callable[[], None]) -> None:
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    told = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: _interrupt(told))
     try:
         main()
     except DsffnetError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_status)
     except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on from here", file=sys.stderr)
-        sys.exit(130)
+        word, status = ("stopped", 143) if told.is_set() else ("interrupted", 130)
+        print(f"{word}; run the same command again to go on from here", file=sys.stderr)
+        sys.exit(status)
     except OSError as error:
         log.debug("as raised", exc_info=True)
         print(f"error: {error}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
         sys.exit(1)
+
+
+def _interrupt(told: threading.Event) -> None:
+    """As Ctrl-C does: Ray's calls would turn a SystemExit into one of status 1."""
+    told.set()
+    raise KeyboardInterrupt
 
 
 def workflow_parser(text: str) -> argparse.ArgumentParser:
@@ -131,7 +140,7 @@ def _sqlite(database: Path) -> Server:
 def server_of_record(root: Path, uri: str | None) -> Server:
     """The server for a record; a run that is no part of a workflow has its SQLite store beside it."""
     record = read_record(root)
-    is_workflow = record is not None and record.kind in ("workflow", "sweep")
+    is_workflow = record is not None and record.kind in ("workflow", "sweep", "comparison", "ablation")
     return server_of(root if is_workflow else root.parent, uri)
 
 

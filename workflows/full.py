@@ -16,7 +16,6 @@ _ROOT = str(Path(__file__).resolve().parents[1])
 if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its files would hide packages
     sys.path[0] = _ROOT
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 
@@ -38,7 +37,7 @@ from workflows.pipeline import (
     train_stage,
 )
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
-from workflows.stages import Stage, run_stage
+from workflows.stages import Stage, once, run_stage
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -68,7 +67,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
     sections = recipe.model_dump(mode="json")
     _refuse_conflicts(recipe, data, run)
     with ExitStack() as around:
-        begin = _once(lambda: _begin(around, recipe, out))
+        begin = once(lambda: _begin(around, recipe, out))
         generate = Stage(
             "generate",
             depends_on=sections["data"],
@@ -124,11 +123,6 @@ def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path) -> None:
         metrics=child.metrics,
         tags=parent.tags | {"mlflow.note.content": (evaluation / "tables.md").read_text()},
     )
-
-
-def _once(work: Callable[[], None]) -> Callable[[], None]:
-    waiting = [work]
-    return lambda: waiting.pop()() if waiting else None
 
 
 if __name__ == "__main__":

@@ -44,6 +44,12 @@ def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
     return True
 
 
+def once(work: Callable[[], None]) -> Callable[[], None]:
+    """The same work, which does nothing from the second call on."""
+    waiting = [work]
+    return lambda: waiting.pop()() if waiting else None
+
+
 def say(text: str) -> None:
     """One line for people, with the time of day, at once."""
     print(f"[{time.strftime('%H:%M:%S')}] {text}", flush=True)

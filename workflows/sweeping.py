@@ -19,7 +19,7 @@ from workflows.cluster import ray_cluster
 from workflows.console import WorkflowError, start_over
 from workflows.pipeline import check_run_accepts, generate_stage, is_complete, recorded
 from workflows.recipe import save_recipe
-from workflows.stages import Stage, run_stage, say
+from workflows.stages import Stage, once, run_stage, say
 from workflows.sweep_progress import SweepProgress
 from workflows.sweep_report import FILES, Result, best_of, results_of, write_report
 from workflows.trial_runs import Outcome, Place, is_finished, prepare, ray_trials
@@ -64,34 +64,68 @@ def run_sweep(
         See :func:`judge`.
     """
     data = str(out / "dataset.zarr")
-    _refuse_conflicts(sweep, data, out)
+    refuse_conflicts(sweep, data, out)
     with ExitStack() as around:
-        begin = _once(lambda: _begin(around, sweep, out, settings))
-        generate = Stage(
-            "generate",
-            depends_on=sweep.recipe.data.model_dump(mode="json"),
-            intact=lambda: is_complete(data),
-            work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out),
+        outcomes = generate_and_train(
+            sweep,
+            out,
+            begin=once(lambda: _begin(around, sweep, out, settings)),
+            running=partial(runner, tags=partial(_tags, sweep), cpus=settings.cpus, gpus=settings.gpus),
+            told=lambda: _report(sweep, out, settings),
         )
-        run_stage(generate, out=out, before=begin)
-        waiting = [trial for trial in sweep.trials if not is_finished(trial, data, out)]
-        if skipped := len(sweep.trials) - len(waiting):
-            say(f"trials: {skipped} of {len(sweep.trials)} skipped, finished before")
-        outcomes: list[Outcome] = []
-        if waiting:
-            begin()
-            say(f"trials: {len(waiting)} begin, {settings.cpus} CPUs each")
-            place = prepare(waiting, data=data, out=out)
-            running = runner(waiting, place, tags=partial(_tags, sweep), cpus=settings.cpus, gpus=settings.gpus)
-            outcomes = _run_trials(sweep, place, settings, running)
         results = results_of(sweep, out) if outcomes else _write_report(sweep, out, settings)
         show(results)
         judge(outcomes, of=len(sweep.trials), strict=settings.strict)
     return results
 
 
-def _run_trials(sweep: Sweep, place: Place, settings: Settings, running: Trials) -> list[Outcome]:
-    """Follow trials until all have ended; the report is brought up to date whenever one does."""
+def generate_and_train(
+    sweep: Sweep,
+    out: Path,
+    *,
+    begin: Callable[[], None],
+    running: Runner,
+    told: Callable[[], None] = lambda: None,
+) -> list[Outcome]:
+    """Make the dataset, and train every trial that is not finished.
+
+    Parameters
+    ----------
+    sweep, out
+        What to train, and where.
+    begin
+        Called before any work; not called if there is none.
+    running
+        Trials and their place -> a generator of how they end, see :func:`workflows.trial_runs.ray_trials`.
+    told
+        Called whenever a trial has ended.
+
+    Returns
+    -------
+    list of Outcome
+        Of the trials that ran now.
+    """
+    data = str(out / "dataset.zarr")
+    generate = Stage(
+        "generate",
+        depends_on=sweep.recipe.data.model_dump(mode="json"),
+        intact=lambda: is_complete(data),
+        work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out),
+    )
+    run_stage(generate, out=out, before=begin)
+    waiting = [trial for trial in sweep.trials if not is_finished(trial, data, out)]
+    if skipped := len(sweep.trials) - len(waiting):
+        say(f"trials: {skipped} of {len(sweep.trials)} skipped, finished before")
+    if not waiting:
+        return []
+    begin()
+    say(f"trials: {len(waiting)} begin")
+    place = prepare(waiting, data=data, out=out)
+    return _follow(sweep, place, running(waiting, place), told)
+
+
+def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None]) -> list[Outcome]:
+    """Follow trials until all have ended."""
     dataset, outcomes = open_dataset(place.data), []
     steps = {trial.name: last_step_of(trial.training, dataset) for trial in sweep.trials}
     with closing(running), SweepProgress(sweep.trials, steps, place.out) as progress:
@@ -99,14 +133,9 @@ def _run_trials(sweep: Sweep, place: Place, settings: Settings, running: Trials)
             if outcome is not None:
                 outcomes.append(outcome)
                 progress.tell(outcome)
-                _report(sweep, place.out, settings)
+                told()
             progress.look()
     return outcomes
-
-
-def _once(work: Callable[[], None]) -> Callable[[], None]:
-    waiting = [work]
-    return lambda: waiting.pop()() if waiting else None
 
 
 def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
@@ -143,7 +172,7 @@ def _tags(sweep: Sweep, trial: Trial) -> dict[str, str]:
     return {f"varied.{key}": value for key, value in varied_values(sweep, trial).items()}
 
 
-def _refuse_conflicts(sweep: Sweep, data: str, out: Path) -> None:
+def refuse_conflicts(sweep: Sweep, data: str, out: Path) -> None:
     """Refuse a folder whose dataset or trials were made by another recipe, before anything in it is touched."""
     if not (Path(data) / "zarr.json").exists():
         return
@@ -155,13 +184,21 @@ def _refuse_conflicts(sweep: Sweep, data: str, out: Path) -> None:
             check_run_accepts(trial.training, open_dataset(data), trial.folder(out))
 
 
-def remove_sweep(out: Path) -> None:
-    """Remove what a sweep keeps in ``out``, its dataset too, and nothing else; the MLflow store stays."""
+def remove_sweep(out: Path, *, kind: str = "sweep", own: Sequence[str] = _OWN) -> None:
+    """Remove what a sweep (or what trains as one) keeps in ``out``, its dataset too; the MLflow store stays.
+
+    Raises
+    ------
+    RecipeError
+        The folder is not one of that kind.
+    """
     record = read_record(out)
-    if (out / "trials").exists() and (record is None or record.kind != "sweep"):
-        raise RecipeError(f"{out} holds trials, but no sweep of ours, so --fresh leaves it alone. Choose another --out")
+    if (out / "trials").exists() and (record is None or record.kind != kind):
+        raise RecipeError(
+            f"{out} holds trials, but no {kind} of ours, so --fresh leaves it alone. Choose another --out"
+        )
     start_over(out)
-    for path in (out / name for name in _OWN):
+    for path in (out / name for name in own):
         if path.is_dir():
             shutil.rmtree(path)
         else:

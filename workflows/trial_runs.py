@@ -183,9 +183,7 @@ def _require_shared_disk(place: Place) -> None:
 
 @contextlib.contextmanager
 def _heeding_sigterm() -> Iterator[threading.Event]:
-    """Note SIGTERM while the block runs. Starting Ray replaced this process's handler by one that aborts it, and one
-    that raises SystemExit loses its status in Ray's calls.
-    """
+    """Note SIGTERM while the block runs, so that trials are told before this process ends."""
     told = threading.Event()
     try:
         before = signal.signal(signal.SIGTERM, lambda *_: told.set())

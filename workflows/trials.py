@@ -111,14 +111,19 @@ def plan_sweep(
             "a sweep needs something to try, e.g. --vary training.learning_rate=0.001,0.002, or --trials with a file "
             f"or one of {', '.join(known_sweeps())}"
         )
+    return resolve(entries, recipe=name, words=words)
+
+
+def resolve(entries: Sequence[TrialEntry], *, recipe: str, words: tuple[str, ...]) -> Sweep:
+    """Entries as trials, each with its whole recipe; the errors are those of :func:`plan_sweep`."""
     _check_names(entries)
-    base = load_recipe(name, words)
+    base = load_recipe(recipe, words)
     if not (base.data.identities.evaluation and base.data.poses.unseen and base.data.triples.count):
         raise RecipeError(
-            f"trials are compared on unseen poses of new identities, of which recipe {name} has none. "
+            f"trials are compared on unseen poses of new identities, of which recipe {recipe} has none. "
             "Use --set data.identities.evaluation=... data.poses.unseen=... data.triples.count=..."
         )
-    return Sweep(name, words, base, tuple(_trial(entry, name, words) for entry in entries))
+    return Sweep(recipe, words, base, tuple(_trial(entry, recipe, words) for entry in entries))
 
 
 def read_sweep(name_or_file: str) -> SweepFile:
@@ -196,7 +201,7 @@ def _check_names(entries: Sequence[TrialEntry]) -> None:
                 f"trial name {entry.name!r} cannot be a folder's: use letters, digits and ._=+- (100 at most)"
             )
         for word in entry.set:
-            if not word.startswith("training."):
+            if not word.startswith(("training.", "training=")):
                 raise RecipeError(
                     f"trial {entry.name} sets {word!r}, but only keys of training can differ between trials, as the "
                     "dataset is made once. Set it for all with --set"
