@@ -1,161 +1,231 @@
-"""Rows (one a triple: who, which pose, every metric) for the trained network and for the two no-op baselines.
+"""Rows (one a triple: who, which pose, every metric) for any number of networks and for the two no-op baselines.
 
-The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
-(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
+Every method is measured on the same triples of a dataset's fixed lists, by tasks that run here or on a cluster; what a
+task does is in :mod:`training.measuring`. Finished chunks are kept, so that a second start does what is missing.
 """
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
+from datagen.errors import DsffnetError
 from datagen.grid import PoseType
-from datagen.mesh import bounding_box, edges_of, write_atomically
 from datagen.store import Dataset, open_dataset
-from training import metrics
-from training.batches import read_batch
+from training import paper
 from training.checkpoint import require_checkpoint
-from training.inference import load_trained, predict
-from training.recipe import EvaluationRecipe
+from training.checkpoint_folder import AVERAGE, WEIGHTS, manifest_of
+from training.earlier import recipe_of
+from training.measuring import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
+from training.recipe import CoreNet3dRecipe, EvaluationRecipe, NetworkRecipe, NptRecipe
+from training.rows import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows
 
-NO_OPS = ("target unchanged", "source unchanged")
-POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
+__all__ = [
+    "NO_OPS",
+    "POSE_TYPES",
+    "EvaluationError",
+    "Method",
+    "Row",
+    "evaluate",
+    "evaluation_list",
+    "measure_chunk",
+    "method_name",
+    "read_rows",
+    "require_pairable",
+    "triples_in",
+    "write_rows",
+]
+
 Runner = Callable[[Callable[..., Any], list[tuple[Any, ...]]], Iterator[Any]]
+Progress = Callable[[Iterable[list[Row]], int, int], Iterable[list[Row]]]
+"""Passes on rows as they come; told the triples of the whole evaluation, and those that were kept from before."""
+
+_MEASURED_AS = 1
+"""Raise this when a metric is computed otherwise, so that rows kept by an earlier version are not taken for new."""
 
 
-@dataclass(frozen=True, order=True)
-class Row:
-    """One method on one evaluation triple. Metrics are in the normalised box unless their name says otherwise."""
-
-    method: str
-    pose_type: str
-    triple: int
-    source_identity: int
-    source_pose: int
-    target_identity: int
-    target_pose: int
-    pmd: float
-    pmd_recentred: float
-    chamfer: float
-    earth_mover: float
-    millimetres: float
-    edge_ratio: float
-    normal_degrees: float
+class EvaluationError(DsffnetError):
+    """Methods and data that cannot be measured together."""
 
 
-def evaluation_list(dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType) -> np.ndarray[Any, Any]:
-    """The first ``recipe.triples`` of the dataset's fixed list."""
-    return dataset.evaluation_triples(pose_type)[: recipe.triples]
+def method_name(network: NetworkRecipe) -> str:
+    """What tables call a network, by its recipe: the paper's name, with what is left out or differs behind it."""
+    if isinstance(network, CoreNet3dRecipe):
+        return paper.CORENET3D
+    if isinstance(network, NptRecipe):
+        return paper.NPT if network.variant == "maxpool" else f"{paper.NPT} {network.variant}"
+    if not network.feature_fusion:
+        return f"{paper.DSFFNET} {paper.WITHOUT_FUSION}"
+    return paper.DSFFNET if network.target_side else f"{paper.DSFFNET} {paper.WITHOUT_TARGET_SIDE}"
 
 
 def evaluate(
-    run: Path,
+    methods: Sequence[Method],
     data: str,
     recipe: EvaluationRecipe,
     *,
     tasks: Runner,
-    method: str = "DSFFNet",
-    progress: Callable[[Iterable[list[Row]], int], Iterable[list[Row]]] = lambda rows, total: rows,
+    keep: Path | None = None,
+    progress: Progress = lambda rows, total, done: rows,
 ) -> list[Row]:
-    """Measure a run on a dataset's fixed evaluation triples; rows come back in a fixed order.
+    """Measure methods and the no-op baselines on a dataset's fixed evaluation triples; rows come in a fixed order.
 
-    ``tasks`` runs functions over argument tuples here or on a cluster (see ``datagen.generate``).
+    A task measures all methods on one chunk of triples: meshes are read once, and slow networks slow every task alike.
+
+    Parameters
+    ----------
+    methods
+        Networks, of any recipe and training; names must differ.
+    data
+        URL of a complete dataset.
+    tasks
+        Runs functions over argument tuples here or on a cluster (see ``datagen.generate``).
+    keep
+        Folder for finished pieces, one small CSV a method and chunk: the same call again measures only what is missing,
+        and one with another method added only that method. Pieces of other weights, data or recipes are removed.
+    progress
+        See :data:`Progress`; :func:`triples_in` counts what comes.
+
+    Raises
+    ------
+    EvaluationError
+        Two methods of one name, no triples, or a network that cannot take the vertex counts.
+    CheckpointError
+        Weights are missing or damaged.
     """
-    dataset, checkpoint = open_dataset(data), require_checkpoint(run, "result").path
-    arguments = [
-        (str(checkpoint), data, recipe, method, pose_type, start)
-        for pose_type in POSE_TYPES
-        for start in range(0, len(evaluation_list(dataset, recipe, pose_type)), recipe.chunk)
-    ]
-    chunks = progress(tasks(measure_chunk, arguments), len(arguments))
-    return sorted(row for chunk in chunks for row in chunk)
+    dataset = open_dataset(data)
+    pieces = _pieces(dataset, _contenders(methods, dataset, recipe), recipe)
+    found = {piece: kept for piece in pieces if keep and (kept := read_piece(keep / piece.file, piece.expected))}
+    missing = _by_chunk(piece for piece in pieces if piece not in found)
+    total = len({chunk for piece in pieces for chunk in piece.triples})
+    done = total - len({chunk for chunk_pieces in missing.values() for chunk in chunk_pieces[0].triples})
+    arguments = [(tuple(p.contender for p in these), data, recipe, *chunk) for chunk, these in missing.items()]
+    for rows in progress(tasks(measure_chunk, arguments), total, done):
+        for piece in missing[_chunk_of(rows)]:
+            found[piece] = [row for row in rows if row.method == piece.contender.name]
+            if keep:
+                write_rows(found[piece], keep / piece.file)
+    if keep:
+        forget_pieces(keep, but=[piece.file for piece in pieces])
+    return sorted(row for rows in found.values() for row in rows)
 
 
-def measure_chunk(
-    checkpoint: str, data: str, recipe: EvaluationRecipe, method: str, pose_type: PoseType, start: int
-) -> list[Row]:
-    """Rows of the triples [start, start + recipe.chunk) of one list, for one checkpoint and the no-op baselines."""
-    dataset, network = open_dataset(data), _network(checkpoint)
-    triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    batch = read_batch(dataset, triples, padded=True)
-    outputs = {method: predict(network, batch), NO_OPS[0]: batch.target}
-    if _one_count(dataset, evaluation_list(dataset, recipe, pose_type)):
-        outputs[NO_OPS[1]] = batch.source
-    return [
-        Row(name, pose_type, start + place, *map(int, triple), *values)
-        for name, output in outputs.items()
-        for place, (triple, values) in enumerate(
-            zip(triples, _measure_each(dataset, triples, output, batch.truth, recipe), strict=True)
+def triples_in(rows: Iterable[Row]) -> int:
+    """How many triples rows are of, each counted once for all methods."""
+    return len({(row.pose_type, row.triple) for row in rows})
+
+
+def require_pairable(name: str, network: NetworkRecipe, source: int, target: int, *, where: str) -> None:
+    """Refuse a network that pairs source and target by index for meshes of different counts.
+
+    Raises
+    ------
+    EvaluationError
+        Naming the method, the counts and ``where`` they are.
+    """
+    if isinstance(network, NptRecipe) and network.variant == "origin" and source != target:
+        raise EvaluationError(
+            f"{name} pairs source and target vertex by vertex (training.network.variant 'origin'), but {where} has a "
+            f"source of {source:,} vertices and a target of {target:,}. Evaluate it on a dataset of one vertex count, "
+            "or train the variant maxpool: --set training.network.variant=maxpool"
         )
-    ]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One method on one chunk of one list; ``file``: what its rows are kept as."""
+
+    contender: Contender
+    pose_type: PoseType
+    start: int
+    stop: int
+    file: str
+
+    @property
+    def triples(self) -> list[tuple[str, int]]:
+        return [(self.pose_type, number) for number in range(self.start, self.stop)]
+
+    @property
+    def expected(self) -> list[tuple[str, str, int]]:
+        return [(self.contender.name, *triple) for triple in self.triples]
+
+
+def _contenders(methods: Sequence[Method], dataset: Dataset, recipe: EvaluationRecipe) -> list[Contender]:
+    names = [method.name for method in methods] + list(NO_OPS)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise EvaluationError(f"two methods are called {twice[0]!r}: give each a name of its own")
+    if not any(len(evaluation_list(dataset, recipe, pose_type)) for pose_type in POSE_TYPES):
+        raise EvaluationError(
+            f"{dataset.url} lists no evaluation triples. Make a dataset that does: --set data.triples.count=400, with "
+            "evaluation identities and at least two poses of a type"
+        )
+    return [*(_resolved(method, dataset, recipe) for method in methods), *(Contender(name, "") for name in NO_OPS)]
+
+
+def _resolved(method: Method, dataset: Dataset, recipe: EvaluationRecipe) -> Contender:
+    checkpoint = require_checkpoint(Path(method.weights), "result")
+    network = recipe_of(checkpoint, network_only=True).network
+    for pose_type in POSE_TYPES:
+        for number, triple in enumerate(evaluation_list(dataset, recipe, pose_type)):
+            counts = dataset.vertex_count(int(triple[0])), dataset.vertex_count(int(triple[2]))
+            require_pairable(method.name, network, *counts, where=f"{pose_type} triple {number} of {dataset.url}")
+    about = {"network": network.model_dump(mode="json"), "files": _hashes(checkpoint.path)}
+    return Contender(method.name, str(checkpoint.path), _digest(about))
+
+
+def _hashes(weights: Path) -> dict[str, str]:
+    if weights.is_dir():
+        return {name: its for name, its in manifest_of(weights)["sha256"].items() if name in (WEIGHTS, AVERAGE)}
+    with open(weights, "rb") as file:
+        return {WEIGHTS: hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def _pieces(dataset: Dataset, contenders: Sequence[Contender], recipe: EvaluationRecipe) -> list[_Piece]:
+    pieces = []
+    for pose_type in POSE_TYPES:
+        listed = evaluation_list(dataset, recipe, pose_type)
+        able = [its for its in contenders if its.name != NO_OPS[1] or _one_count(dataset, listed)]
+        for start in range(0, len(listed), recipe.chunk):
+            triples = listed[start : start + recipe.chunk]
+            pieces += [_piece(dataset, its, recipe, pose_type, start, triples) for its in able]
+    return pieces
+
+
+def _piece(
+    dataset: Dataset, contender: Contender, recipe: EvaluationRecipe, pose_type: PoseType, start: int, triples: Any
+) -> _Piece:
+    about = {
+        "measured_as": [_MEASURED_AS, *(field.name for field in fields(Row))],
+        "method": [contender.name, contender.sha256],
+        "dataset": [dataset.uuid, dataset.attributes["manifest_sha256"]],
+        "triples": [pose_type, start, triples.tolist()],
+        "earth_mover": [recipe.emd_points, recipe.seed],
+    }
+    return _Piece(contender, pose_type, start, start + len(triples), piece_name(pose_type, start, _digest(about)))
+
+
+def _digest(about: Any) -> str:
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _by_chunk(pieces: Iterable[_Piece]) -> dict[tuple[PoseType, int], list[_Piece]]:
+    chunks: dict[tuple[PoseType, int], list[_Piece]] = {}
+    for piece in pieces:
+        chunks.setdefault((piece.pose_type, piece.start), []).append(piece)
+    return chunks
+
+
+def _chunk_of(rows: list[Row]) -> Any:
+    return rows[0].pose_type, min(row.triple for row in rows)
 
 
 def _one_count(dataset: Dataset, triples: NDArray[np.integer]) -> bool:
     """Whether all sources and targets of a list have as many vertices, so that a source can stand for an output."""
     identities = np.unique(triples[:, [0, 2]]).tolist()
     return len({dataset.vertex_count(identity) for identity in identities}) == 1
-
-
-def _measure_each(
-    dataset: Dataset, triples: NDArray[np.integer], output: Tensor, truth: Tensor, recipe: EvaluationRecipe
-) -> list[tuple[float, ...]]:
-    """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
-    found: dict[int, tuple[float, ...]] = {}
-    for identity in np.unique(triples[:, 2]).tolist():
-        places, count = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.vertex_count(identity)
-        half = torch.tensor([_half_size(dataset, identity, int(triples[place, 1])) for place in places])
-        ours, right = output[places, :count], truth[places, :count]
-        found |= zip(places, _measure(ours, right, dataset.faces(identity), half, recipe), strict=True)
-    return [found[place] for place in range(len(triples))]
-
-
-def _measure(
-    output: Tensor, truth: Tensor, faces: NDArray[np.int32], half: Tensor, recipe: EvaluationRecipe
-) -> list[tuple[float, ...]]:
-    edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
-    columns = (
-        metrics.point_mesh_distance(output, truth),
-        metrics.recentred_point_mesh_distance(output, truth),
-        metrics.chamfer_distance(output, truth),
-        metrics.earth_mover_distance(output, truth, points=recipe.emd_points, seed=recipe.seed),
-        metrics.mean_euclidean_error(output, truth) * half * 1000,
-        metrics.edge_length_ratio_error(output, truth, edges),
-        metrics.normal_angle_error(output, truth, triangles),
-    )
-    return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _half_size(dataset: Dataset, identity: int, pose: int) -> float:
-    """Metres that one unit of the normalised box is, for one mesh."""
-    return float(bounding_box(dataset.vertices(identity, pose)).half)
-
-
-@lru_cache(maxsize=1)
-def _network(checkpoint: str) -> nn.Module:
-    return load_trained(Path(checkpoint))[0]
-
-
-def write_rows(rows: list[Row], path: Path) -> None:
-    """Write rows as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(Row)])
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    write_atomically(path, text.getvalue().encode())
-
-
-def read_rows(path: Path) -> list[Row]:
-    """Rows of a CSV that :func:`write_rows` wrote."""
-    with open(path, encoding="utf-8") as file:
-        return [
-            Row(**{field.name: field.type(line[field.name]) for field in fields(Row)})  # type: ignore[operator]
-            for line in csv.DictReader(file)
-        ]

@@ -4,7 +4,6 @@ import json
 import platform
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from datagen.store.verify import describe
 from training.checkpoint import CheckpointError, Which, is_finished, load_checkpoint, require_checkpoint
 from training.curves import draw_coefficients
 from training.earlier import recipe_of
-from training.evaluation import NO_OPS, Row, evaluate, write_rows
+from training.evaluation import NO_OPS, Method, Row, evaluate, method_name, triples_in, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
 from training.launch import launch
@@ -34,8 +33,6 @@ from workflows.console import alone_in
 from workflows.evaluated import evaluated
 from workflows.progress import bar, following, sampling
 from workflows.stages import say
-
-METHOD = "DSFFNet"
 
 
 @contextmanager
@@ -59,6 +56,14 @@ def generation_bar(rows: Iterable[ManifestRow], grid: Grid) -> Iterator[Manifest
         for row in rows:
             shown.update(row.rows)
             yield row
+
+
+def evaluation_bar(chunks: Iterable[list[Row]], total: int, done: int) -> Iterator[list[Row]]:
+    """A bar that counts triples while chunks of rows come in; ``done`` of them were measured before."""
+    with bar(total=total, initial=done, what="evaluate", unit="triple") as shown:
+        for rows in chunks:
+            shown.update(triples_in(rows))
+            yield rows
 
 
 def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Path | None) -> None:
@@ -121,19 +126,13 @@ def evaluate_stage(
 ) -> str:
     """Measure a run or weights, write rows, tables, figures, meshes and viewer; returns the report."""
     dataset, what = open_dataset(data), evaluated(place, which)
-    network, _, step = load_trained(what.weights)
+    network, trained, step = load_trained(what.weights)
+    method = Method(method_name(trained.network), str(what.weights))
     folder = what.folder(dataset)
     with recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=recipe.model_dump(mode="json")):
         with sampling(folder / "system.jsonl"):
-            progress = partial(bar, what="evaluate", unit="task")
-            rows = evaluate(
-                what.weights,
-                data,
-                recipe,
-                tasks=ray_runner,
-                method=METHOD,
-                progress=lambda chunks, n: progress(chunks, total=n),
-            )
+            keep = folder / "measured"
+            rows = evaluate([method], data, recipe, tasks=ray_runner, keep=keep, progress=evaluation_bar)
         write_rows(rows, folder / "rows.csv")
         about = f"Weights of step {step:,} on {Path(dataset.url).name} ({dataset.uuid})."
         text = report(rows, title=_title(dataset), about=about, emd_points=_emd_points(recipe, dataset))
@@ -209,10 +208,13 @@ def is_evaluated(recipe: EvaluationRecipe, data: str, run: Path) -> bool:
 
 
 def summary_metrics(rows: list[Row]) -> dict[str, float]:
-    """Means of the metrics as MLflow shows them, in the table's units: ``pmd_unseen``, ``no_op/...``."""
-    found = {}
+    """Means of the metrics as MLflow shows them, in the table's units: ``pmd_unseen``, ``target_unchanged/...``.
+
+    Where several networks were measured, theirs have their names before them: ``DSFFNet/pmd_unseen``.
+    """
+    found, networks = {}, [method for method in methods_of(rows) if method not in NO_OPS]
     for method in methods_of(rows):
-        prefix = "" if method == METHOD else f"{method.replace(' ', '_')}/"
+        prefix = "" if networks == [method] else f"{method.replace(' ', '_')}/"
         for pose_type in sorted({row.pose_type for row in rows}):
             for column in COLUMNS:
                 mean = mean_of(rows, method=method, pose_type=pose_type, field=column.field)

@@ -1,6 +1,8 @@
-"""Evaluation: rows, tables, transfer."""
+"""Evaluation (many methods, resumable), and transfer of single meshes."""
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,21 +11,38 @@ import torch
 from datagen.errors import MeshError
 from datagen.generate import generate, inline
 from datagen.mesh import Mesh, bounding_box, edges_of
-from datagen.store import open_dataset
+from datagen.store import Dataset, open_dataset
 from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import tiny_dataset, tiny_training
+from training import evaluation, measuring
 from training.batches import read_batch
-from training.checkpoint import CheckpointError, require_checkpoint
-from training.evaluation import NO_OPS, Row, evaluate, measure_chunk, read_rows, write_rows
+from training.checkpoint import CheckpointError, export_weights, require_checkpoint
+from training.evaluation import (
+    NO_OPS,
+    EvaluationError,
+    Method,
+    Row,
+    evaluate,
+    measure_chunk,
+    method_name,
+    read_rows,
+    triples_in,
+    write_rows,
+)
 from training.inference import load_trained, predict
+from training.measuring import Contender
 from training.metrics import edge_length_ratio_error, point_mesh_distance
-from training.recipe import EvaluationRecipe
+from training.recipe import CoreNet3dRecipe, DsffnetRecipe, EvaluationRecipe, NetworkRecipe, NptRecipe
 from training.showcase import examples_of
-from training.tables import markdown, mean_of, methods_of, report, summary
+from training.tables import methods_of
 from training.trainer import train
 from training.transfer import PoseTransfer
 
 RECIPE = EvaluationRecipe(emd_points=16, chunk=3)
+
+
+def ours(weights: Path) -> Method:
+    return Method("DSFFNet", str(weights))
 
 
 @pytest.fixture
@@ -34,7 +53,7 @@ def run(dataset: str, tmp_path: Path) -> Path:
 
 def test_rows_are_those_of_the_fixed_list_and_no_ops_score_what_they_must(dataset: str, run: Path) -> None:
     opened = open_dataset(dataset)
-    rows = evaluate(run, dataset, RECIPE, tasks=inline)
+    rows = evaluate([ours(run)], dataset, RECIPE, tasks=inline)
     assert len(rows) == 5 * 2 * 3 and methods_of(rows) == ["DSFFNet", *NO_OPS]
     listed = opened.evaluation_triples("unseen").tolist()
 
@@ -55,9 +74,9 @@ def test_rows_are_those_of_the_fixed_list_and_no_ops_score_what_they_must(datase
 
 
 def test_any_cutting_into_tasks_gives_the_same_rows(dataset: str, run: Path) -> None:
-    whole = evaluate(run, dataset, RECIPE.model_copy(update={"chunk": 100}), tasks=inline)
+    whole = evaluate([ours(run)], dataset, RECIPE.model_copy(update={"chunk": 100}), tasks=inline)
     reversed_tasks = lambda task, arguments: iter([task(*each) for each in reversed(arguments)])  # noqa: E731
-    pieces = evaluate(run, dataset, RECIPE.model_copy(update={"chunk": 1}), tasks=reversed_tasks)
+    pieces = evaluate([ours(run)], dataset, RECIPE.model_copy(update={"chunk": 1}), tasks=reversed_tasks)
     assert [(r.method, r.pose_type, r.triple) for r in whole] == [(r.method, r.pose_type, r.triple) for r in pieces]
     assert [r.pmd for r in whole] == pytest.approx([r.pmd for r in pieces], rel=1e-4)
 
@@ -65,7 +84,7 @@ def test_any_cutting_into_tasks_gives_the_same_rows(dataset: str, run: Path) -> 
 def test_meshes_of_other_counts_are_each_measured_over_their_own_vertices(tmp_path: Path) -> None:
     data = generate(mixed_dataset(), str(tmp_path / "mixed.zarr"))
     train(tiny_training(steps=2), data=data.url, run=tmp_path / "run")
-    rows = evaluate(tmp_path / "run", data.url, RECIPE, tasks=inline)
+    rows = evaluate([ours(tmp_path / "run")], data.url, RECIPE, tasks=inline)
     assert methods_of(rows) == ["DSFFNet", NO_OPS[0]], "a source of another count can stand for no output"
     assert len({data.vertex_count(row.target_identity) for row in rows}) > 1
     network = load_trained(tmp_path / "run")[0]
@@ -81,30 +100,181 @@ def test_meshes_of_other_counts_are_each_measured_over_their_own_vertices(tmp_pa
 
 
 def test_rows_survive_csv(dataset: str, run: Path, tmp_path: Path) -> None:
-    rows = measure_chunk(str(require_checkpoint(run).path), dataset, RECIPE, "DSFFNet", "seen", 0)
+    contenders = [Contender('DSFFNet, 3 "steps"', str(require_checkpoint(run).path)), Contender(NO_OPS[0], "")]
+    rows = measure_chunk(contenders, dataset, RECIPE, "seen", 0)
     write_rows(rows, tmp_path / "rows.csv")
     assert read_rows(tmp_path / "rows.csv") == rows
 
 
-def row(method: str, pose_type: str, triple: int, pmd: float) -> Row:
-    return Row(method, pose_type, triple, 0, 0, 1, 1, pmd, pmd, 0.1, 0.2, 3.0, 0.04, 5.0)
+class Tasks:
+    """Runs tasks here, counts them, and may fail after some."""
+
+    def __init__(self, fail_after: int | None = None) -> None:
+        self.measured: list[tuple[list[str], str, int]] = []
+        self._fail_after = fail_after
+
+    def __call__(self, task: Callable[..., Any], arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        for contenders, *rest in arguments:
+            if len(self.measured) == self._fail_after:
+                raise KeyboardInterrupt
+            self.measured.append(([contender.name for contender in contenders], rest[2], rest[3]))
+            yield task(contenders, *rest)
 
 
-def test_the_table_means_what_it_says() -> None:
-    rows = [row("DSFFNet", "seen", 0, 1e-4), row("DSFFNet", "seen", 1, 3e-4), row("target unchanged", "seen", 0, 5e-2)]
-    assert mean_of(rows, method="DSFFNet", pose_type="seen", field="pmd") == pytest.approx(2e-4)
-    lines = summary(rows)
-    assert lines[1] == ["seen", "DSFFNet", "2.00", "2.00", "1000.00", "200.00", "3.0", "0.040", "5.0"]
-    assert [line[1] for line in lines[1:]] == ["DSFFNet", "target unchanged"]
-    text = report(rows, title="T", about="A.", emd_points=64)
-    assert "2 with seen poses" in text and "assignment (exact) of 64 vertices" in text
-    widths = {len(line) for line in markdown(lines).splitlines()}
-    assert len(widths) == 1, "columns line up"
+@pytest.fixture
+def other(dataset: str, tmp_path: Path) -> Path:
+    """A run of NPT."""
+    train(
+        tiny_training(network={"name": "npt", "encoder_widths": (8, 8, 13)}, steps=2), data=dataset, run=tmp_path / "n"
+    )
+    return tmp_path / "n"
+
+
+def test_all_methods_are_measured_on_the_same_triples_as_each_would_be_alone(
+    dataset: str, run: Path, other: Path
+) -> None:
+    tasks = Tasks()
+    together = evaluate([ours(run), Method("NPT", str(other))], dataset, RECIPE, tasks=tasks)
+    assert methods_of(together) == ["DSFFNet", "NPT", *NO_OPS]
+    assert [(pose_type, start) for _, pose_type, start in tasks.measured] == [
+        (t, s) for t in ("seen", "unseen") for s in (0, 3)
+    ]
+    alone = [evaluate([method], dataset, RECIPE, tasks=inline) for method in (ours(run), Method("NPT", str(other)))]
+    assert together == sorted({*alone[0], *alone[1]})
+    of = [[as_key(row) for row in together if row.method == method] for method in methods_of(together)]
+    assert len(of[0]) == 10 and all(keys == of[0] for keys in of)
+
+
+def as_key(row: Row) -> tuple[Any, ...]:
+    return row.pose_type, row.triple, row.source_identity, row.source_pose, row.target_identity, row.target_pose
+
+
+def test_after_an_interruption_only_what_is_missing_is_measured(dataset: str, run: Path, tmp_path: Path) -> None:
+    keep, first, seen = tmp_path / "kept", Tasks(fail_after=2), []
+
+    def progress(chunks: Iterable[list[Row]], total: int, done: int) -> Iterator[list[Row]]:
+        seen.append((total, done))
+        for rows in chunks:
+            seen.append((triples_in(rows), len(rows)))
+            yield rows
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate([ours(run)], dataset, RECIPE, tasks=first, keep=keep, progress=progress)
+    assert seen == [(10, 0), (3, 9), (2, 6)]
+    seen.clear()
+    second = Tasks()
+    rows = evaluate([ours(run)], dataset, RECIPE, tasks=second, keep=keep, progress=progress)
+    assert [start for _, _, start in second.measured] == [0, 3] and seen == [(10, 5), (3, 9), (2, 6)]
+    assert rows == evaluate([ours(run)], dataset, RECIPE, tasks=inline)
+    third = Tasks()
+    assert evaluate([ours(run)], dataset, RECIPE, tasks=third, keep=keep) == rows and third.measured == []
+
+
+def test_a_method_that_is_added_is_measured_alone(dataset: str, run: Path, other: Path, tmp_path: Path) -> None:
+    evaluate([ours(run)], dataset, RECIPE, tasks=inline, keep=tmp_path / "kept")
+    tasks, both = Tasks(), [ours(run), Method("NPT", str(other))]
+    rows = evaluate(both, dataset, RECIPE, tasks=tasks, keep=tmp_path / "kept")
+    assert {tuple(names) for names, _, _ in tasks.measured} == {("NPT",)}
+    assert rows == evaluate(both, dataset, RECIPE, tasks=inline)
+
+
+@pytest.mark.parametrize("change", ["weights", "points", "seed", "dataset", "network", "damage", "cut"])
+def test_kept_rows_of_anything_else_are_not_taken(
+    dataset: str, run: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep, recipe, method = tmp_path / "kept", RECIPE, ours(run / "checkpoints" / "step-00000008")
+    evaluate([method], dataset, recipe, tasks=inline, keep=keep)
+    before, tasks = sorted(keep.iterdir()), Tasks()
+    (keep / "notes.csv").write_text("a person's")
+    if change == "weights":
+        method = ours(run / "checkpoints" / "step-00000004")
+    elif change in ("points", "seed"):
+        recipe = RECIPE.model_copy(update={"emd_points": 8} if change == "points" else {"seed": 1})
+    elif change == "dataset":
+        monkeypatch.setattr(Dataset, "uuid", "another")
+    elif change == "network":
+        monkeypatch.setattr(
+            evaluation, "recipe_of", lambda *_, **__: tiny_training(network={"encoder_widths": (9, 9, 9)})
+        )
+    else:
+        path = next(path for path in before if "DSFFNet" in path.read_text())
+        text = path.read_text()
+        path.write_text(text[:-3].rsplit("\n", 1)[0] if change == "cut" else text.replace("seen", "s\0n", 1))
+    evaluate([method], dataset, recipe, tasks=tasks, keep=keep)
+    names = {name for names, _, _ in tasks.measured for name in names}
+    assert "DSFFNet" in names and (change not in ("weights", "network", "damage", "cut") or names == {"DSFFNet"})
+    assert len(tasks.measured) == (1 if change in ("damage", "cut") else 4)
+    after = [path for path in sorted(keep.iterdir()) if path.name != "notes.csv"]
+    assert (keep / "notes.csv").exists() and len(after) == len(before)
+    assert (after == before) == (change in ("damage", "cut"))
+
+
+def test_weights_written_to_the_same_place_are_loaded_anew(dataset: str, run: Path, tmp_path: Path) -> None:
+    file, found = tmp_path / "exported", []
+    for step in (4, 8):
+        export_weights(require_checkpoint(run, step), file)
+        found.append(evaluate([ours(file)], dataset, RECIPE, tasks=inline, keep=tmp_path / "kept")[0].pmd)
+    expected = [evaluate([ours(run / f"checkpoints/step-0000000{n}")], dataset, RECIPE, tasks=inline) for n in (4, 8)]
+    assert found == [rows[0].pmd for rows in expected] and found[0] != found[1]
+
+
+def test_an_output_that_is_not_finite_is_nan_and_spoils_no_other(
+    dataset: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Diverged(torch.nn.Module):
+        def forward(self, *, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+            return target / 0
+
+    monkeypatch.setattr(measuring, "_network", lambda *_: Diverged())
+    rows = evaluate([ours(run)], dataset, RECIPE, tasks=inline)
+    values = {row.method: (row.pmd, row.chamfer, row.earth_mover, row.edge_ratio, row.normal_degrees) for row in rows}
+    assert np.isnan(values["DSFFNet"]).all() and np.isfinite(values[NO_OPS[0]]).all()
+
+
+def test_methods_that_cannot_be_told_apart_are_refused(dataset: str, run: Path) -> None:
+    for name in ("DSFFNet", NO_OPS[1]):
+        methods = [ours(run), Method(name, str(run))]
+        with pytest.raises(EvaluationError, match=f"two methods are called '{name}'"):
+            evaluate(methods, dataset, RECIPE, tasks=inline)
+
+
+def test_a_network_that_pairs_vertices_is_refused_where_counts_differ(tmp_path: Path, dataset: str) -> None:
+    pairing = {"name": "npt", "variant": "origin", "encoder_widths": (8, 8, 13)}
+    train(tiny_training(network=pairing, steps=2), data=dataset, run=tmp_path / "origin")
+    methods, mixed = (
+        [Method("NPT", str(tmp_path / "origin"))],
+        generate(mixed_dataset(), str(tmp_path / "mixed.zarr")).url,
+    )
+    assert len(evaluate(methods, dataset, RECIPE, tasks=inline)) == 30
+    pattern = r"NPT pairs .*'origin'\), but (un)?seen triple \d of .*mixed.zarr has a source of 3\d vertices .* of 3\d"
+    with pytest.raises(EvaluationError, match=pattern):
+        evaluate(methods, mixed, RECIPE, tasks=inline)
+
+
+def test_data_without_triples_are_refused(tmp_path: Path, run: Path) -> None:
+    data = generate(tiny_dataset(triples={"count": 0}), str(tmp_path / "none.zarr"))
+    with pytest.raises(EvaluationError, match=r"none.zarr lists no evaluation triples.*data.triples.count=400"):
+        evaluate([ours(run)], data.url, RECIPE, tasks=inline)
+
+
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [
+        (DsffnetRecipe(), "DSFFNet"),
+        (DsffnetRecipe(feature_fusion=False), "DSFFNet w/o FFAdaIN"),
+        (DsffnetRecipe(target_side=False), "DSFFNet w/o side target"),
+        (NptRecipe(), "NPT"),
+        (NptRecipe(variant="origin"), "NPT origin"),
+        (CoreNet3dRecipe(), "3D-CoreNet"),
+    ],
+)
+def test_networks_have_the_names_of_the_paper(network: NetworkRecipe, name: str) -> None:
+    assert method_name(network) == name
 
 
 def test_a_run_without_weights(dataset: str, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="has no usable checkpoint"):
-        evaluate(tmp_path / "nothing", dataset, RECIPE, tasks=inline)
+        evaluate([ours(tmp_path / "nothing")], dataset, RECIPE, tasks=inline)
 
 
 class TestTransfer:

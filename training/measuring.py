@@ -1,0 +1,125 @@
+"""Measuring some methods on one chunk of evaluation triples: the work of one task of an evaluation.
+
+The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
+(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from datagen.grid import PoseType
+from datagen.mesh import bounding_box, edges_of
+from datagen.store import Dataset, open_dataset
+from training import metrics
+from training.batches import Batch, read_batch
+from training.inference import load_trained, predict
+from training.recipe import EvaluationRecipe
+from training.rows import Row
+
+NO_OPS = ("target unchanged", "source unchanged")
+POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A network to measure: its name in tables, and its weights.
+
+    ``weights``: a run, a checkpoint's folder or a file of weights (see ``training.checkpoint.require_checkpoint``).
+    """
+
+    name: str
+    weights: str
+
+
+@dataclass(frozen=True)
+class Contender(Method):
+    """A method whose weights are known: by the checkpoint's own path and a hash of them. No-ops have neither."""
+
+    sha256: str = ""
+
+
+def evaluation_list(dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType) -> np.ndarray[Any, Any]:
+    """The first ``recipe.triples`` of the dataset's fixed list."""
+    return dataset.evaluation_triples(pose_type)[: recipe.triples]
+
+
+def measure_chunk(
+    contenders: Sequence[Contender], data: str, recipe: EvaluationRecipe, pose_type: PoseType, start: int
+) -> list[Row]:
+    """Rows of the triples [start, start + recipe.chunk) of one list, for each contender."""
+    dataset = open_dataset(data)
+    triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
+    batch, groups = read_batch(dataset, triples, padded=True), _groups(dataset, triples)
+    return [
+        Row(contender.name, pose_type, start + place, *map(int, triple), *values)
+        for contender in contenders
+        for place, (triple, values) in enumerate(
+            zip(triples, _measure_each(groups, _output(contender, batch), batch.truth, recipe), strict=True)
+        )
+    ]
+
+
+def _output(contender: Contender, batch: Batch) -> Tensor:
+    if contender.name in NO_OPS:
+        return batch.target if contender.name == NO_OPS[0] else batch.source
+    return predict(_network(contender.weights, contender.sha256), batch)
+
+
+@lru_cache(maxsize=8)
+def _network(weights: str, sha256: str) -> nn.Module:
+    """The network of weights, once a process; ``sha256`` tells weights apart that were written to one place."""
+    return load_trained(Path(weights))[0]
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Triples of one target identity in a chunk: their places, vertices, edges, faces, and metres a box unit is."""
+
+    places: list[int]
+    count: int
+    edges: Tensor
+    faces: Tensor
+    metres: Tensor
+
+
+def _groups(dataset: Dataset, triples: NDArray[np.integer]) -> list[_Group]:
+    return [_group(dataset, triples, identity) for identity in np.unique(triples[:, 2]).tolist()]
+
+
+def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Group:
+    places, faces = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.faces(identity)
+    metres = [float(bounding_box(dataset.vertices(identity, int(triples[place, 1]))).half) for place in places]
+    edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
+    return _Group(places, dataset.vertex_count(identity), edges, triangles, torch.tensor(metres, dtype=torch.float64))
+
+
+def _measure_each(
+    groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe
+) -> list[tuple[float, ...]]:
+    """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
+    found: dict[int, tuple[float, ...]] = {}
+    for group in groups:
+        ours, right = output[group.places, : group.count], truth[group.places, : group.count]
+        found |= zip(group.places, _measure(ours, right, group, recipe), strict=True)
+    return [found[place] for place in range(len(found))]
+
+
+def _measure(output: Tensor, truth: Tensor, group: _Group, recipe: EvaluationRecipe) -> list[tuple[float, ...]]:
+    columns = (
+        metrics.point_mesh_distance(output, truth),
+        metrics.recentred_point_mesh_distance(output, truth),
+        metrics.chamfer_distance(output, truth),
+        metrics.earth_mover_distance(output, truth, points=recipe.emd_points, seed=recipe.seed),
+        metrics.mean_euclidean_error(output, truth) * group.metres * 1000,
+        metrics.edge_length_ratio_error(output, truth, group.edges),
+        metrics.normal_angle_error(output, truth, group.faces),
+    )
+    return list(zip(*(column.tolist() for column in columns), strict=True))
