@@ -1,0 +1,204 @@
+"""What was run: command, commit, versions, machine, and the stages with their times, from the records in a folder."""
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import shlex
+import subprocess
+import time
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from training.journal import read_journal
+from training.record import Record, find_records, read_record
+from training.report_blocks import Block, Code, Facts, ReportError, Section, Table
+from training.report_links import shown
+
+COMMAND_TAG = "dsffnet.command"
+"""The tag of a record that holds the command line, where it was noted."""
+
+_PACKAGES = ("torch", "numpy", "scipy", "zarr", "ray", "mlflow", "anny")
+
+
+def what_was_run(out: Path) -> Section:
+    """Command, commit, versions, machine, and when each stage ran for how long, of whatever left its record in ``out``.
+
+    Raises
+    ------
+    ReportError
+        There is no record.
+    """
+    record = read_record(out)
+    if record is None:
+        raise ReportError(f"{out} holds no record.json, so nothing was run there. Name the folder of a workflow")
+    body: list[Block] = [Facts(_facts(record, out)), _stages(out)]
+    recipe = out / "recipe.yaml"
+    if recipe.is_file():
+        body.append(Code(recipe.read_text(encoding="utf-8"), folded="The whole recipe (recipe.yaml)"))
+    return Section("What was run", tuple(body))
+
+
+def this_machine() -> dict[str, str]:
+    """Processor, memory, system and GPUs of this machine, for people; no name that would tell whose it is."""
+    facts = {
+        "processor": f"{_processor()}, {_cores()} cores",
+        "memory": f"{psutil.virtual_memory().total / 2**30:.0f} GiB",
+        "GPU": _gpus(),
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+    }
+    return {name: fact for name, fact in facts.items() if fact}
+
+
+@cache
+def this_commit() -> str:
+    """The commit of the code that is running, and whether files differ from it; "unknown" for an installed copy."""
+    commit = _git("rev-parse", "HEAD")
+    if not commit:
+        return "unknown"
+    return f"{commit} with local changes" if _git("status", "--porcelain", "--untracked-files=no") else commit
+
+
+def provenance_of(run: Path) -> dict[str, Any]:
+    """What a training noted of its software, machine and data (RUN/provenance.json); empty where it did not."""
+    with suppress(OSError, ValueError):
+        return dict(json.loads((run / "provenance.json").read_text()))
+    return {}
+
+
+def moment(milliseconds: float) -> str:
+    """A time since 1970 as people write it, in UTC."""
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(milliseconds / 1000))
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people say them: 41 s, 6 min 42 s, 3 h 5 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s" if whole >= 10 else f"{seconds:.1f} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:
+    noted = record.tags.get(COMMAND_TAG)
+    script = Path(record.tags.get("mlflow.source.name", "workflows/full.py"))
+    script_name = f"{script.parent.name}/{script.name}" if script.suffix == ".py" else script.name
+    packages = {name: _version(name) for name in _PACKAGES}
+    commit, hardware = (provenance_of(out / "run").get(name) for name in ("git_commit", "hardware"))
+    facts: dict[str, str | int | float | Code] = {"name": f"{record.name} ({record.kind})"}
+    if noted:
+        facts["command"] = Code(_without_places(noted, out))
+    if record.kind == "workflow":
+        again = ["python", script_name, "--recipe", f"{shown(out)}/recipe.yaml", "--out", "OUT"]
+        facts["the same again"] = Code(shlex.join(again))
+    facts["begun"] = moment(record.started)
+    facts["status"] = _status(record)
+    facts["commit" if commit else "commit of this report"] = Code(commit or this_commit())
+    facts["versions"] = ", ".join(f"{name} {version}" for name, version in packages.items() if version)
+    facts["machine" if hardware else "machine of this report"] = "; ".join((hardware or this_machine()).values())
+    return facts
+
+
+def _status(record: Record) -> str:
+    if record.ended is None or record.status == "RUNNING":
+        return "still running when this report was written"
+    return f"{record.status.lower()} {moment(record.ended)}, after {duration((record.ended - record.started) / 1000)}"
+
+
+def _without_places(command: str, out: Path) -> str:
+    """A command whose absolute paths are cut to what they name: a report tells nothing of the machine's folders."""
+    named = command.replace(str(out.resolve()), shown(out))
+    return re.sub(r"(?<![\w.:/])/(?:[^\s'\"/]+/)+([^\s'\"/]+)", r"\1", named)
+
+
+def _stages(out: Path) -> Table:
+    """A line for each record below ``out``, in the order of their beginnings."""
+    lines = [["stage", "folder", "begun", "took", "status", "CPU %, mean", "memory GB, most", "GPU %, mean"]]
+    folders = [folder for folder in find_records(out) if folder != out.resolve()]
+    lines += [_stage(folder, out) for folder in folders]
+    kept = [place for place in range(len(lines[0])) if place < 5 or any(line[place] for line in lines[1:])]
+    return Table([[line[place] for place in kept] for line in lines], "Stages", _NOTES)
+
+
+_NOTES = """\
+*Took*: of the command that finished the stage, where that was noted, else from its first beginning to its end. Load is
+the whole machine's, every five seconds, other programs included."""
+
+
+def _stage(folder: Path, out: Path) -> list[str]:
+    record = read_record(folder)
+    assert record is not None
+    load = read_journal(folder / "system.jsonl")
+    relative = Path(os.path.relpath(folder, out.resolve())).as_posix()
+    status = "running" if record.ended is None else record.status.lower()
+    seconds = _seconds(record, out)
+    return [
+        record.name,
+        relative,
+        moment(record.started),
+        "" if seconds is None else duration(seconds),
+        status,
+        _load(load, "system/cpu_utilization_percentage"),
+        _load(load, "system/system_memory_usage_megabytes", most=True, unit=1e3, decimals=1),
+        _load(load, "system/gpu_0_utilization_percentage"),
+    ]
+
+
+def _load(rows: list[dict[str, Any]], key: str, *, most: bool = False, unit: float = 1.0, decimals: int = 0) -> str:
+    values = [row[key] / unit for row in rows if key in row]
+    if not values:
+        return ""
+    return f"{max(values) if most else sum(values) / len(values):.{decimals}f}"
+
+
+def _seconds(record: Record, out: Path) -> float | None:
+    """The time of the command that finished a stage; a mark that is older than the stage's end is an earlier one's."""
+    if record.ended is None:
+        return None
+    mark = out / "stages" / f"{record.name}.json"
+    with suppress(OSError, ValueError, KeyError):
+        if mark.stat().st_mtime * 1000 >= record.ended:
+            return float(json.loads(mark.read_text())["seconds"])
+    return (record.ended - record.started) / 1000
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    with suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    return ""
+
+
+def _processor() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _gpus() -> str:
+    import torch
+
+    if not torch.cuda.is_available():
+        return ""
+    names = [torch.cuda.get_device_name(place) for place in range(torch.cuda.device_count())]
+    return ", ".join(f"{names.count(name)} x {name}" for name in dict.fromkeys(names))
