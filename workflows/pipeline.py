@@ -135,7 +135,7 @@ def evaluate_stage(
             rows = evaluate([method], data, recipe, tasks=ray_runner, keep=keep, progress=evaluation_bar)
         write_rows(rows, folder / "rows.csv")
         about = f"Weights of step {step:,} on {Path(dataset.url).name} ({dataset.uuid})."
-        text = report(rows, title=_title(dataset), about=about, emd_points=_emd_points(recipe, dataset))
+        text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
         write_atomically(folder / "tables.md", text.encode())
         draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
         if (what.home / "metrics.jsonl").exists():  # exported weights have none
@@ -254,7 +254,8 @@ def _title(dataset: Dataset) -> str:
     return f"Pose transfer on {recipe.body.family} bodies of {counts} vertices"
 
 
-def _emd_points(recipe: EvaluationRecipe, dataset: Dataset) -> int:
+def emd_points_of(recipe: EvaluationRecipe, dataset: Dataset) -> int:
+    """Vertices that the earth mover's distance is taken of: as asked, or as many as there are."""
     return min(recipe.emd_points, _vertex_counts(dataset)[1])
 
 

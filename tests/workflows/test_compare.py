@@ -1,0 +1,94 @@
+"""Comparisons from start to end, on legs: trained, measured on the same triples, shown; then nothing is left to do."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mlflow
+import pytest
+
+from training.evaluation import read_rows
+from training.record import read_record
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "--set", "data.body.family=leg", "data.body.rings=8", "data.body.segments=4", "data.identities.training=3",
+    "data.identities.evaluation=2", "data.poses.seen=6", "data.poses.unseen=4", "data.triples.count=5",
+    "training.steps=6", "training.evaluate_every=3", "training.batch=2", "training.log_every=1",
+    "evaluation.emd_points=16", "evaluation.examples=1",
+]  # fmt: skip
+
+
+def run(script: str, out: Path, *words: str) -> str:
+    command = [sys.executable, f"workflows/{script}.py", "--out", str(out), *SMALL, *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    out = tmp_path_factory.mktemp("runs") / "compare"
+    return out, run("compare", out)
+
+
+def test_every_method_and_no_op_is_measured_on_the_same_triples(compared: tuple[Path, str]) -> None:
+    out, _ = compared
+    rows = read_rows(out / "evaluation" / "rows.csv")
+    methods = ["DSFFNet", "NPT", "3D-CoreNet", "target unchanged", "source unchanged"]
+    assert {row.method for row in rows} == set(methods)
+    asked = {
+        name: sorted(
+            (r.pose_type, r.triple, r.source_identity, r.source_pose, r.target_identity, r.target_pose)
+            for r in rows
+            if r.method == name
+        )
+        for name in methods
+    }
+    assert len(asked["NPT"]) == 10 and all(triples == asked["NPT"] for triples in asked.values())
+
+
+def test_tables_figures_viewer_and_report_are_there_and_say_the_same(compared: tuple[Path, str]) -> None:
+    out, said = compared
+    table = (out / "evaluation" / "tables.md").read_text()
+    assert table in said and all(f"Table {number}" in table for number in (1, 2))
+    report = (out / "report.md").read_text()
+    pmd = {row.method: row.pmd for row in read_rows(out / "evaluation" / "rows.csv")}
+    assert set(pmd) >= {"DSFFNet", "NPT", "3D-CoreNet"}
+    for name in ("DSFFNet", "NPT", "3D-CoreNet"):
+        assert name in report and name in table
+    assert "2.39" in table, "the paper's own numbers stand beside ours"
+    for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", report):
+        assert (out / name).stat().st_size > 1000, name
+    page = (out / "report.html").read_text()
+    assert page.count("<img") == page.count('src="data:image/png;base64,') >= 2
+    assert (out / "evaluation" / "viewer.html").stat().st_size > 10_000
+
+
+def test_mlflow_shows_a_parent_its_trainings_and_the_evaluation(compared: tuple[Path, str]) -> None:
+    out, _ = compared
+    client = mlflow.MlflowClient(f"sqlite:///{out / 'mlflow.db'}")
+    runs = client.search_runs([client.get_experiment_by_name("dsffnet").experiment_id])
+    names = {run.info.run_name: run for run in runs}
+    parent = names["Comparison of methods: small"]
+    children = {name for name, r in names.items() if r.data.tags.get("mlflow.parentRunId") == parent.info.run_id}
+    assert children == {"generate", "DSFFNet", "NPT", "3D-CoreNet", "evaluate"}
+    assert {"report.html", "report.md"} <= {item.path for item in client.list_artifacts(parent.info.run_id)}
+    assert any("pmd" in metric for metric in parent.data.metrics)
+
+
+def test_the_same_command_again_has_nothing_to_do(compared: tuple[Path, str]) -> None:
+    out, _ = compared
+    before = {path: path.stat().st_mtime_ns for path in (out / "evaluation").rglob("*") if path.is_file()}
+    said = run("compare", out)
+    assert "trials: 3 of 3 skipped" in said and "evaluate: skipped" in said
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_an_ablation_trains_four_and_gives_table_three(tmp_path: Path) -> None:
+    said = run("ablation", tmp_path / "ablation")
+    assert "Table 3" in said and all(name in said for name in ("w/o FFAdaIN", "w/o side target", "w/o L_edge"))
+    assert (tmp_path / "ablation" / "evaluation" / "figures" / "ablation.png").stat().st_size > 5000
+    record = read_record(tmp_path / "ablation")
+    assert record is not None and record.kind == "ablation" and record.status == "FINISHED"

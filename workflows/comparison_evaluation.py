@@ -1,0 +1,79 @@
+"""What trained methods are measured on: the same triples for all; rows -> tables, figures, meshes, viewer."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from training.method_figures import ablation_figure, convergence_figure
+
+from datagen.generate import ray_runner
+from datagen.mesh import write_atomically
+from datagen.store import Dataset
+from training.batches import Batch, read_batch
+from training.checkpoint import require_checkpoint
+from training.evaluation import POSE_TYPES, Method, Row, evaluate, evaluation_list, write_rows
+from training.inference import load_trained
+from training.inference_time import Inference, measure_inference
+from training.recipe import EvaluationRecipe
+from training.record import update_record
+from training.showcase import comparisons_of, draw_comparisons
+from workflows.comparison_plan import ComparisonPlan
+from workflows.comparison_tables import as_markdown, tables_of
+from workflows.pipeline import about_dataset, evaluation_bar, recorded, summary_metrics
+from workflows.progress import sampling
+
+_OUTPUTS = ("rows.csv", "tables.md", "viewer.html", "inference.json")
+FOLDER = "evaluation"
+
+
+def weights_of(runs: Mapping[str, Path]) -> dict[str, str]:
+    """The checkpoint that each method is measured with, as a word that changes with it."""
+    return {name: require_checkpoint(run, "result").path.name for name, run in runs.items()}
+
+
+def intact(out: Path) -> bool:
+    """Whether the outputs of the evaluation are there."""
+    return all((out / FOLDER / name).is_file() for name in _OUTPUTS)
+
+
+def read_inference(out: Path) -> dict[str, Inference]:
+    """Size and time of each method, as :func:`evaluate_methods` measured them."""
+    found = json.loads((out / FOLDER / "inference.json").read_text())
+    return {name: Inference(**values) for name, values in found.items()}
+
+
+def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], out: Path) -> None:
+    """Measure every method on the dataset's fixed triples, and show it."""
+    recipe, folder = plan.recipe.evaluation, out / FOLDER
+    about = recorded(folder, kind="evaluate", name="evaluate", parent=out, parameters=recipe.model_dump(mode="json"))
+    with about, sampling(folder / "system.jsonl"):
+        methods = [Method(name, str(require_checkpoint(run, "result").path)) for name, run in runs.items()]
+        rows = evaluate(methods, dataset.url, recipe, tasks=ray_runner, keep=folder / "chunks", progress=evaluation_bar)
+        write_rows(rows, folder / "rows.csv")
+        inference = measure_inference(methods, vertices=_first_pair(dataset, recipe), threads=1)
+        values = {name: asdict(its) for name, its in inference.items()}
+        write_atomically(folder / "inference.json", json.dumps(values, indent=1).encode())
+        text = as_markdown(plan, tables_of(plan, dataset, runs, rows, inference), plan.description)
+        write_atomically(folder / "tables.md", text.encode())
+        _draw(plan, dataset, runs, rows, folder)
+        update_record(
+            folder,
+            dataset=about_dataset(dataset),
+            artifacts=["rows.csv", "tables.md", "viewer.html", "inference.json", "figures", "meshes"],
+            metrics=summary_metrics(rows),
+        )
+
+
+def _first_pair(dataset: Dataset, recipe: EvaluationRecipe) -> Batch:
+    lists = [evaluation_list(dataset, recipe, pose_type) for pose_type in POSE_TYPES]
+    return read_batch(dataset, next(triples for triples in lists if len(triples))[:1])
+
+
+def _draw(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], rows: list[Row], folder: Path) -> None:
+    networks = {name: load_trained(run)[0] for name, run in runs.items()}
+    examples = comparisons_of(dataset, networks, plan.recipe.evaluation, rows)
+    draw_comparisons(examples, folder, title=plan.title)
+    convergence_figure(runs, folder / "figures" / "convergence.png")
+    if plan.kind == "ablation":
+        ablation_figure(rows, folder / "figures" / "ablation.png")
