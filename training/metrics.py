@@ -51,6 +51,9 @@ EARTH_MOVER_POINTS = 1024
 
 Points = NDArray[np.float64]
 
+_SOFTNESS, _ROUNDS, _TINY = 0.02, 40, np.float32(1e-30)
+"""Of the prices that speed up an assignment: their blur as a part of the mean cost, and rounds of scaling."""
+
 
 def point_mesh_distance(prediction: Tensor, truth: Tensor) -> Tensor:
     """Return PMD, the mean over vertices *and coordinates* of ``(prediction - truth)^2``, in box^2.
@@ -121,6 +124,10 @@ def earth_mover_distance(
     the same ``min(points, n)`` vertices of both, drawn by `seed` without replacement. Over all vertices
     ``EMD <= sqrt(3 PMD)``; over fewer the same with the PMD of those. EMD grows as the points thin out, since a vertex
     then finds its nearest partners missing: compare figures of one number of points only.
+
+    It is what an evaluation's time goes into. Measured on one core with bodies of Anny: a pair of 1,024 points takes
+    25 ms where prediction and truth are near (PMD 9e-4) and 60 ms where they are far apart (PMD 830e-4), 615 points 7
+    and 17 ms; all other metrics together take 2 to 5 ms at 1,229 vertices, and 35 to 145 ms (CD) at 13,718.
 
     Parameters
     ----------
@@ -213,7 +220,26 @@ def _drawn(count: int, points: int, seed: int) -> NDArray[np.int64]:
 
 def _assignment(prediction: Points, truth: Points) -> float:
     costs = cdist(prediction, truth)
-    return float(costs[linear_sum_assignment(costs)].mean())
+    if not costs.any():
+        return 0.0
+    return float(costs[linear_sum_assignment(_reduced(costs))].mean())
+
+
+def _reduced(costs: Points) -> Points:
+    """Costs less a price for every row and column: the same assignments are best, and they are found sooner.
+
+    Any prices would do; these nearly are those of the best assignment, from a few rounds of Sinkhorn's matrix scaling
+    in float32. A row of the solver then looks at few columns before it finds its own.
+    """
+    least, softness = costs.min(axis=1, keepdims=True), costs.mean() * _SOFTNESS
+    kernel = np.exp(((least - costs) / softness).astype(np.float32))
+    columns = np.ones(len(costs), np.float32)
+    for _ in range(_ROUNDS):
+        rows = 1 / np.maximum(kernel @ columns, _TINY)
+        columns = 1 / np.maximum(rows @ kernel, _TINY)
+    reduced = costs - softness * np.log(columns.astype(np.float64))
+    reduced -= reduced.min(axis=1, keepdims=True)
+    return reduced - reduced.min(axis=0)
 
 
 def _lengths(vertices: Tensor, edges: Tensor) -> Tensor:
