@@ -65,7 +65,7 @@ def frame(
         Share of the panel left free on each side.
     """
     points = np.concatenate([checked_vertices(mesh.vertices) for mesh in meshes])
-    turn, rise = np.radians([_azimuth(meshes) if azimuth is None else azimuth, elevation])
+    turn, rise = np.radians([azimuth_of(meshes) if azimuth is None else azimuth, elevation])
     direction = np.array([np.sin(turn) * np.cos(rise), np.sin(rise), np.cos(turn) * np.cos(rise)])
     axes = axes_of(direction)
     in_view = points @ axes.T
@@ -77,17 +77,10 @@ def frame(
     return Camera(eye=_triple(target + distance * direction), target=_triple(target))
 
 
-def shape_in_view(meshes: Sequence[MeshLike]) -> float:
-    """Return height divided by width of the view that holds some meshes, as `frame` looks at them."""
-    axes = frame(meshes).axes()
-    across, above = np.ptp(np.concatenate([np.asarray(mesh.vertices, float) for mesh in meshes]) @ axes.T, axis=0)[:2]
-    return float(above / max(across, 1e-12))
-
-
-def _azimuth(meshes: Sequence[MeshLike]) -> float:
+def azimuth_of(meshes: Sequence[MeshLike]) -> float:
     """Return degrees from the front: a horse seen head-on hides its body, a person seen from the side hides a leg."""
     widths, depths = np.array([np.ptp(np.asarray(mesh.vertices, float), axis=0)[[0, 2]] for mesh in meshes]).T
-    return 62.0 if np.median(depths / np.maximum(widths, 1e-12)) > 2 else 28.0
+    return 62.0 if np.median(depths / np.maximum(widths, 1e-12)) > 1.7 else 28.0
 
 
 def axes_of(backward: Floats) -> Floats:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from training.camera import MeshLike
+from training.camera import Camera, MeshLike, azimuth_of, frame
 from training.rasteriser import Floats, Integers
 
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
@@ -160,8 +160,24 @@ def _size(vertices: Floats) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def to_frame(meshes: Mapping[str, Solid]) -> list[Solid]:
-    """Return what a picture must hold of placed meshes: an output that strays far does not shrink all the others."""
+def camera_of(meshes: Mapping[str, Solid], size: tuple[int, int] = (320, 400)) -> Camera:
+    """Return the camera that holds the placed meshes of a comparison in a panel of `size` pixels.
+
+    The side it looks from suits source, target and truth, whatever the outputs look like.
+    """
+    known = [mesh for name, mesh in meshes.items() if not name.startswith("output ")]
+    return frame(_to_hold(meshes), size=size, azimuth=azimuth_of(known), margin=0.055)
+
+
+def in_view(meshes: Mapping[str, Solid]) -> tuple[Floats, Floats, Floats]:
+    """Return the axes [3, 3] of that camera as rows, and the least and largest coordinates [3] along them."""
+    axes = camera_of(meshes).axes()
+    points = np.concatenate([mesh.vertices for mesh in _to_hold(meshes)]) @ axes.T
+    return axes, points.min(0), points.max(0)
+
+
+def _to_hold(meshes: Mapping[str, Solid]) -> list[Solid]:
+    """Return what a picture must hold: an output that strays far from the truth does not shrink all the others."""
     known = [mesh for name, mesh in meshes.items() if not name.startswith("output ")]
     if "truth" not in meshes:
         return list(meshes.values())

@@ -8,8 +8,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from training.camera import Camera, frame, shape_in_view
-from training.comparison import Comparison, ErrorScale, Solid, best_of, methods_in, output_of, placed, to_frame
+from training.camera import Camera
+from training.comparison import (
+    Comparison,
+    ErrorScale,
+    Solid,
+    best_of,
+    camera_of,
+    in_view,
+    methods_in,
+    output_of,
+    placed,
+)
 from training.figure_style import INK, PAGE, QUIET, RULE, saved
 from training.page import Page
 from training.palette import ROLE_COLORS, error_colors, method_colors
@@ -141,7 +151,7 @@ class _Row:
 
     def strips(self, columns: _Columns, limit: float) -> list[_Strip]:
         """The meshes and, where they have a strip of their own, the errors."""
-        camera = frame(to_frame(self.meshes), size=columns.panel, margin=0.055)
+        camera = camera_of(self.meshes, columns.panel)
         meshes = {place: self.picture(name, camera, columns.panel) for place, name in enumerate(columns.names)}
         heats = {
             place: self.heat(method, camera, columns.panel, limit) for place, method in enumerate(columns.methods, 2)
@@ -178,15 +188,16 @@ class _Errors:
 
 def _panel(rows: Sequence[_Row]) -> tuple[int, int]:
     """Panels as high as most rows need: tall for people, low for dogs."""
-    shapes = [shape_in_view(to_frame(row.meshes)) for row in rows]
-    return _WIDTH, round(_WIDTH * float(np.clip(np.median(shapes), 0.7, 1.3)))
+    extents = [high - low for _, low, high in (in_view(row.meshes) for row in rows)]
+    shape = np.median([extent[1] / max(extent[0], 1e-12) for extent in extents])
+    return _WIDTH, round(_WIDTH * float(np.clip(shape, 0.7, 1.3)))
 
 
 def _draw_headings(page: Page, columns: _Columns) -> None:
     colors, several = method_colors(columns.methods), len(columns.methods) > 1
     for column, name in enumerate(columns.names):
         method = name.removeprefix("output ")
-        heading, meaning = _MEANING.get(name, (method, "transferred"))
+        heading, meaning = _MEANING.get(name, (method, "no-op" if method.endswith(" unchanged") else "transferred"))
         middle, room = columns.middle(column), columns.panel[0] - 16
         page.text(middle, 34, heading, size=10, weight="bold", anchor="center", room=room)
         page.text(middle, 68, meaning, size=7, color=QUIET, anchor="center", room=room)

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.mesh import write_atomically
-from training.camera import frame
-from training.comparison import Comparison, ErrorScale, Solid, best_of, methods_in, output_of, placed, to_frame
+from training.comparison import Comparison, ErrorScale, Solid, best_of, in_view, methods_in, output_of, placed
 from training.lighting import ground_shadow, openness
 from training.palette import ERROR_COLORS, ROLE_COLORS, method_colors
 from training.rasteriser import Floats, Integers
@@ -164,13 +163,11 @@ def _shared_faces(faces: Integers, vertex_count: int, triangles: dict[str, dict[
 
 def _view(meshes: dict[str, Solid]) -> dict[str, Any]:
     """Return an example's first view, that of the pictures: its direction, and the extent to hold."""
-    framed = to_frame(meshes)
-    axes = frame(framed).axes()
-    in_view = np.concatenate([mesh.vertices for mesh in framed]) @ axes.T
-    extent = np.ptp(in_view, axis=0)
+    axes, low, high = in_view(meshes)
+    extent = high - low
     return {
         "direction": axes[2].tolist(),
-        "center": ((in_view.min(0) + in_view.max(0)) / 2 @ axes).tolist(),
+        "center": ((low + high) / 2 @ axes).tolist(),
         "width": float(extent[0]),
         "height": float(extent[1]),
         "depth": float(extent[2]),
