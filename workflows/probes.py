@@ -1,0 +1,102 @@
+"""What studies of trained weights (robustness, generalisation) share: whose weights, where results go, what is kept.
+
+Results are files in one folder; a record beside them lets ``dsffnet sync FOLDER`` send them to MLflow.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from datagen.mesh import write_atomically
+from training.record import read_record, update_record
+from training.scores import Method, load_methods
+from workflows.cluster import require_reachable
+from workflows.evaluated import Evaluated, evaluated, which_checkpoint
+
+_SETTINGS = "settings.json"
+
+
+def add_weights_options(made: argparse.ArgumentParser) -> None:
+    """RUN ..., --checkpoint and --out."""
+    made.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folders of trainings, a workflow's, checkpoints or weights"
+    )
+    made.add_argument(
+        "--checkpoint",
+        type=which_checkpoint,
+        default="result",
+        metavar="result|latest|best|STEP",
+        help="which of the runs' weights (result: the best where early stopping ended a run, else the latest)",
+    )
+    made.add_argument("--out", metavar="FOLDER", help="where results go (default: below the run, or runs/ for several)")
+
+
+def weights_of(options: argparse.Namespace) -> list[Evaluated]:
+    """The weights that a person named.
+
+    Raises
+    ------
+    CheckpointError
+        A place has none, or they are damaged.
+    """
+    places = [Path(require_reachable(run, option="RUN")) for run in options.runs]
+    return [evaluated(place, options.checkpoint) for place in places]
+
+
+def methods_of(weights: Sequence[Evaluated]) -> list[Method]:
+    """Their networks, named after their networks and, where that is not unique, their folders."""
+    return load_methods([its.weights for its in weights], labels=[_shown(its) for its in weights])
+
+
+def _shown(weights: Evaluated) -> str:
+    """What a person calls weights: their run's folder (a workflow's where the run is its ``run``), and their label."""
+    home = weights.home.resolve()
+    name = home.parent.name if home.name == "run" else home.name
+    return " ".join(filter(None, (name, weights.label)))
+
+
+def folder_of(options: argparse.Namespace, weights: Sequence[Evaluated], study: str) -> Path:
+    """Where results go: as asked; below the evaluations of the one run; or runs/STUDY."""
+    if options.out:
+        return Path(require_reachable(options.out, option="--out"))
+    if len(weights) > 1:
+        return Path("runs") / study
+    name = "-".join(filter(None, ("evaluation", weights[0].label)))
+    return weights[0].home / name / study
+
+
+def parent_of(weights: Sequence[Evaluated]) -> Path | None:
+    """The recorded run that a study belongs to, where it is of one run."""
+    home = weights[0].home
+    return home if len(weights) == 1 and read_record(home) else None
+
+
+def about_weights(weights: Sequence[Evaluated]) -> list[str]:
+    """What tells these weights from all others, as plain data."""
+    return [f"{its.weights.resolve()} step {its.checkpoint.step} dataset {its.checkpoint.dataset}" for its in weights]
+
+
+def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
+    """Whether a folder's rows were measured with these settings; from now on the folder's rows are."""
+    path, text = folder / _SETTINGS, json.dumps(settings, indent=1, sort_keys=True)
+    same = path.exists() and path.read_text() == text
+    if not same:
+        (folder / "rows.csv").unlink(missing_ok=True)
+        write_atomically(path, text.encode())
+    return same
+
+
+@contextmanager
+def study(
+    folder: Path, name: str, weights: Sequence[Evaluated], settings: dict[str, Any], artifacts: Sequence[str]
+) -> Iterator[dict[str, float]]:
+    """Record a study while the block runs; the block fills the dictionary with the metrics to show."""
+    from workflows.pipeline import recorded
+
+    metrics: dict[str, float] = {}
+    with recorded(folder, kind="evaluate", name=name, parent=parent_of(weights), parameters=settings):
+        yield metrics
+        update_record(folder, artifacts=[its for its in artifacts if (folder / its).exists()], metrics=metrics)
