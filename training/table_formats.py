@@ -18,7 +18,7 @@ THEIRS = "paper"
 """What the cell begins with that marks a line as a paper's own numbers."""
 
 STYLE = """\
-table.results {border-collapse: collapse; font: 14px/1.4 system-ui, sans-serif; font-variant-numeric: tabular-nums}
+table.results {border-collapse: collapse; margin: 1.5em 0; font: 14px/1.4 system-ui, sans-serif; font-variant-numeric: tabular-nums}
 table.results caption {caption-side: top; text-align: left; font-weight: 600; padding: 0 0 .5em}
 table.results th, table.results td {padding: .25em .8em; text-align: right; white-space: nowrap; font-weight: 400}
 table.results th[scope=row], table.results .words {text-align: left}
@@ -30,6 +30,7 @@ table.results strong {font-weight: 700}
 """A page's style sheet for :func:`html`."""
 
 _NUMBER = re.compile(r"\d[\d,]*(\.\d+)?")
+_BEGINS_AS_NUMBER = re.compile(r"[+-]?\d[\d,.]*( |$)")
 _NO_OP = "unchanged"
 
 
@@ -95,17 +96,20 @@ def _html_line(lines: Lines, row: int, best: set[tuple[int, int]]) -> str:
 
 def _words(lines: Lines, place: int) -> str:
     """Columns of words, unlike those of numbers, begin at the left."""
-    is_words = not any(_NUMBER.match(lines[row][place].lstrip("+-")) for row in _rows(lines))
+    is_words = not any(_BEGINS_AS_NUMBER.match(lines[row][place]) for row in _rows(lines))
     return ' class="words"' if is_words else ""
 
 
 def _best(lines: Lines) -> set[tuple[int, int]]:
-    """(row, column) of the lowest numbers of each column, ours and theirs apart, poses apart, no-ops left out."""
+    """(row, column) of the lowest numbers of each column, ours and theirs apart, poses apart, no-ops left out.
+
+    A column in which all are equal has no best.
+    """
     found: set[tuple[int, int]] = set()
     for group in _groups(lines):
         for place in range(1, len(lines[0])):
             numbers = np.array([_number(lines[row][place]) for row in group])
-            if np.isfinite(numbers).sum() > 1:
+            if len(np.unique(numbers[np.isfinite(numbers)])) > 1:
                 found |= {(group[at], place) for at in np.flatnonzero(numbers == np.nanmin(numbers)).tolist()}
     return found
 

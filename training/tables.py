@@ -135,7 +135,7 @@ def note_1(*, data: paper.PaperData = "SMPL", here: str, emd_points: int) -> str
     """What stands under Table 1: units, and that theirs is of other data; ``here``: what ours was measured on."""
     meshes = {"SMPL": "SMPL humans of 6,890 vertices, 16 x 400", "SMAL": "SMAL animals of 3,889 vertices, 24 x 300"}
     return (
-        f"{_UNITS.format(points=emd_points)} Ours: {here}. Lines marked *{THEIRS}* are the paper's own numbers on "
+        f"{_UNITS.format(points=emd_points)} Ours: {here}. Lines marked '{THEIRS}' are the paper's own numbers on "
         f"other data ({meshes[data]} meshes learned for 200 epochs; EMD of an unstated number of points): bodies, "
         "vertex counts and training budget differ, so that they stand here for orientation, not as a target. Some of "
         "its EMD exceed sqrt(3 PMD), which no EMD over the vertices of the PMD can."
@@ -163,7 +163,7 @@ def note_2(inference: Mapping[str, Inference]) -> str:
     return (
         f"Ours: median of {its.rounds} rounds in which the networks took turns, on one pair of {its.source_vertices:,} "
         f"(source) and {its.target_vertices:,} (target) vertices in float32 on {its.device} with {threads}; weights "
-        f"loaded, kernels warm. Lines marked *{THEIRS}* are the paper's own, on an {paper.INFERENCE_DEVICE} GPU: "
+        f"loaded, kernels warm. Lines marked '{THEIRS}' are the paper's own, on an {paper.INFERENCE_DEVICE} GPU: "
         "another machine, so that only the order and the ratios of times can be compared."
     )
 

@@ -205,6 +205,12 @@ def test_best_of_seen_and_of_unseen_are_looked_for_apart() -> None:
     assert {"1.00", "3.00"} <= set(bold) and not {"5.00", "7.00"} & set(bold)
 
 
+def test_what_is_equal_has_no_best_and_names_that_begin_with_digits_are_words() -> None:
+    text = html(table_1(rows_of({"3D-CoreNet": 1, "NPT": 5})))
+    assert '<th scope="col" class="words">method</th>' in text and '<th scope="col">seen PMD</th>' in text
+    assert "200.00" not in Table(text).bold, "EMD of both"
+
+
 def test_markdown_can_be_emphasised() -> None:
     text = markdown(emphasised(table_1(rows_of({"DSFFNet": 1, "NPT": 5}))))
     assert "**1.00**" in text and "***0.57***" in text and "*2.39*" in text and " 5.00 " in text
