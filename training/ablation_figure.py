@@ -126,8 +126,8 @@ def _draw_interval(axes: Axes, y: float, interval: tuple[float, float, float], *
 def _write_value(axes: Axes, y: float, mean: float, reference: float, *, prominent: bool) -> None:
     """Write a mean beside the axes, and how many times the reference's it is."""
     words = f"{mean:.3g}" if mean == reference else f"{mean:.3g}  ×{mean / reference:.2f}"
-    style = {"color": INK, "fontsize": 7.5} if prominent else {"color": QUIET, "fontsize": 6.5}
-    axes.text(1.03, y, words, transform=axes.get_yaxis_transform(), va="center", **style)
+    color, size = (INK, 7.5) if prominent else (QUIET, 6.5)
+    axes.text(1.03, y, words, transform=axes.get_yaxis_transform(), va="center", color=color, fontsize=size)
 
 
 def _styled(axes: Axes, count: int) -> None:
