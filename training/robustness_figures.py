@@ -153,7 +153,7 @@ def _output(method: Method, case: Case, source: Mesh) -> Panel:
     (output,) = transfer_each(method.network, [(source.vertices, case.target.vertices)])
     found = case.score(output)
     vertices = standing(bounding_box(case.truth.vertices).restore(output), case.truth.vertices)
-    caption = f"PMD {found.pmd * 1e4:.1f}e-4, {found.millimetres:.0f} mm"
+    caption = found.words
     return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
 
 

@@ -50,6 +50,12 @@ class Score:
     edge_ratio: float
     normal_degrees: float
 
+    @property
+    def words(self) -> str:
+        """PMD and millimetres, for a caption."""
+        pmd = self.pmd * 1e4
+        return f"PMD {pmd:.{1 if pmd < 99.95 else 0}f}e-4, {self.millimetres:.0f} mm"
+
 
 SCORES = tuple(field.name for field in fields(Score))
 

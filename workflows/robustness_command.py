@@ -119,7 +119,7 @@ def _measured(
 
 def _draw(folder: Path, rows: Sequence[RobustnessRow], methods: Sequence[Method], case: Case) -> None:
     robustness_curves(rows, folder / "curves.png", title=f"A disturbed source: PMD over {_count(rows)} triples")
-    who = "to identity {2} from identity {0}, unseen pose {1}".format(*case.triple)
+    who = "to identity {2} from identity {0}, pose {1}".format(*case.triple)
     title = f"Noise on the source, standard deviation in half the longest box edge ({who})"
     disturbance_picture(case, methods, noise_levels(), folder / "noise.png", title=title)
     title = f"Other disturbances of the source ({who})"
