@@ -131,10 +131,11 @@ def _table(table: Table) -> str:
 
 
 def _class(table: Table, column: int) -> str:
-    """Numbers stand at the right; short words are not broken into two lines."""
+    """Numbers stand at the right; short words are not broken into two lines, and long ones have room."""
     if table.numeric[column]:
         return ' class="number"'
-    return ' class="short"' if all(len(line[column]) <= _SHORT for line in table.lines) else ""
+    short = all(len(line[column]) <= _SHORT for line in table.lines)
+    return ' class="short"' if short else ' class="long"'
 
 
 def _cell(cell: str, attributes: str, *, head: bool) -> str:

@@ -48,7 +48,8 @@ def _table(table: Table) -> str:
     ]
     rule = "|" + "|".join("-" * (width + 1) + (":" if number else "-") for width, number in columns) + "|"
     drawn = "\n".join([texts[0], rule, *texts[1:]])
-    caption, notes = inline_markdown(table.caption), markup_markdown(table.notes)
+    caption = f"**{_plain(inline_text(table.caption))}**" if table.caption else ""
+    notes = markup_markdown(table.notes)
     return "\n\n".join(part for part in (caption, drawn, notes) if part)
 
 

@@ -94,7 +94,7 @@ def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:
     commit, hardware = (provenance_of(out / "run").get(name) for name in ("git_commit", "hardware"))
     facts: dict[str, str | int | float | Code] = {"name": f"{record.name} ({record.kind})"}
     if noted:
-        facts["command"] = Code(_without_places(noted, out))
+        facts["command"] = Code(_shareable(noted, out))
     if record.kind == "workflow":
         again = ["python", script_name, "--recipe", f"{shown(out)}/recipe.yaml", "--out", "OUT"]
         facts["the same again"] = Code(shlex.join(again))
@@ -112,9 +112,9 @@ def _status(record: Record) -> str:
     return f"{record.status.lower()} {moment(record.ended)}, after {duration((record.ended - record.started) / 1000)}"
 
 
-def _without_places(command: str, out: Path) -> str:
-    """A command whose absolute paths are cut to what they name: a report tells nothing of the machine's folders."""
-    named = command.replace(str(out.resolve()), shown(out))
+def _shareable(command: str, out: Path) -> str:
+    """A command without passwords in URLs, its absolute paths cut to what they name, so that it can be handed on."""
+    named = re.sub(r"://[^/@\s]+@", "://", command.replace(str(out.resolve()), shown(out)))
     return re.sub(r"(?<![\w.:/])/(?:[^\s'\"/]+/)+([^\s'\"/]+)", r"\1", named)
 
 
