@@ -1,6 +1,7 @@
 """Reports: what a reader meets is what the blocks hold, whole, harmless, and found again from where the file lies."""
 
 import base64
+import hashlib
 import re
 import struct
 import zlib
@@ -96,7 +97,7 @@ def test_links_of_both_files_lead_to_what_lies_beside_them(tmp_path: Path) -> No
     picture, page = png(tmp_path / "deep/a curve (1).png"), tmp_path / "deep/viewer.html"
     page.write_text("<p>turn me</p>")
     reader, markdown = written(tmp_path / "reports", Picture(picture, "The curve"), Page(page, "To be turned"))
-    found = re.findall(r"\]\(([^)\s]+)\)", markdown) + [reader.all("iframe")[0]["data-src"]]
+    found = [*re.findall(r"\]\(([^)\s]+)\)", markdown), reader.all("iframe")[0]["data-src"]]
     targets = {(tmp_path / "reports" / unquote(link or "")).resolve() for link in found}
     assert targets == {picture.resolve(), page.resolve()} and len(found) == 3
     assert reader.all("iframe")[0]["loading"] == "lazy"
@@ -175,7 +176,9 @@ def test_the_best_of_each_group_are_marked_ties_too() -> None:
 
 
 def test_a_document_of_ours_becomes_blocks_and_comes_out_as_it_was(tmp_path: Path) -> None:
-    document = "# Title\n\nAbout **this**.\n\n| a | b |\n|---|--:|\n| x \\| y | **1** |\n\n- one\n\n| c |\n|---|\n| 2 |\n"
+    document = (
+        "# Title\n\nAbout **this**.\n\n| a | b |\n|---|--:|\n| x \\| y | **1** |\n\n- one\n\n| c |\n|---|\n| 2 |\n"
+    )
     blocks = document_blocks(document)
     assert blocks == (
         Text("About **this**."),
@@ -197,8 +200,6 @@ def test_contents_list_every_section_and_no_two_share_a_place(tmp_path: Path) ->
 
 
 def test_the_only_script_is_the_one_that_the_page_vouches_for(tmp_path: Path) -> None:
-    import hashlib
-
     written(tmp_path)
     page = (tmp_path / "report.html").read_text()
     (script,) = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
