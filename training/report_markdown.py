@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from training.report_blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, bare, is_marked
+from training.report_blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, cell_of
 from training.report_inline import inline_markdown, inline_text, markup_markdown, plain
 from training.report_links import link_to
 
@@ -54,8 +54,8 @@ def _table(table: Table) -> str:
 
 
 def _cell(cell: str) -> str:
-    text = _plain(bare(cell))
-    return f"**{text}**" if is_marked(cell) else text
+    its = cell_of(cell)
+    return f"{its.stars}{_plain(its.text)}{its.stars}"
 
 
 def _padded(cell: str, width: int, number: bool) -> str:
