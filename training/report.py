@@ -52,6 +52,7 @@ __all__ = [
     "pictures_of",
     "plain",
     "report_is_current",
+    "report_of_sweep",
     "this_commit",
     "this_machine",
     "what_was_run",
@@ -67,6 +68,7 @@ CAPTIONS = {
     "examples": "Source, target, output, ground truth and error: the first triples of each fixed list, not chosen "
     "by result.",
     "training-curve": "Losses, PMD on fixed evaluation triples, and the learning rate, over the steps of training.",
+    "sweep": "PMD on unseen poses over steps and over seconds of training.",
     "adaptive-coefficients": "The adaptive coefficients of each FFAdaIN: 0, the target's own features modulate alone; "
     "1, those mixed with the source's pose code.",
 }
@@ -130,6 +132,34 @@ def workflow_report(out: Path) -> tuple[Path, Path]:
     ]
     sections = [section for section in sections if section.body]
     return write_report(out, title=_title(record.name, dataset), lead=_lead(out, dataset, rows), sections=sections)
+
+
+def report_of_sweep(out: Path) -> tuple[Path, Path]:
+    """The report of what ``dsffnet sweep`` leaves in ``out``, also while trials still run: table, figure, trials, data.
+
+    Raises
+    ------
+    ReportError
+        There is no sweep's table.
+    DatasetError
+        The dataset is missing or incomplete.
+    """
+    table, record = out / "sweep.md", read_record(out)
+    if record is None or not table.is_file():
+        missing = table.name if record else "record.json"
+        raise ReportError(
+            f"{out} holds no sweep (no {missing}). Begin one: dsffnet sweep --trials networks --out {out}"
+        )
+    dataset = open_dataset(str(out / "dataset.zarr"))
+    results = (*document_blocks(table.read_text(encoding="utf-8")), *pictures_of(out / "figures"))
+    sections = [
+        Section("Results", results),
+        what_was_run(out),
+        dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
+    ]
+    counts = span(vertex_counts(dataset))
+    lead = f"Trainings side by side on {plain(dataset.recipe.body.family)} bodies of {counts} vertices, best first."
+    return write_report(out, title=f"Sweep {record.name}", lead=lead, sections=sections)
 
 
 def report_is_current(out: Path) -> bool:

@@ -6,13 +6,14 @@ words of users go through :func:`~training.report_inline.plain` first. All else 
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from datagen.errors import DsffnetError
 
 _ONE = r"[-+±~<>≤≥x]?\s?\d[\d,]*\.?\d*(?:e[-+]?\d+)?(?:\s?(?:%|°|[A-Za-zµ]{1,3}))?"
-_NUMBER = re.compile(rf"{_ONE}(?:\s?[/±]\s?{_ONE})*")
+_NUMBER = re.compile(rf"{_ONE}(?:\s?(?:[/±]|to)\s?{_ONE})*(?:\s\({_ONE}(?:\s?to\s?{_ONE})?\))?")
+_MARKED = re.compile(r"(?P<stars>\*{1,3})(?P<text>[^*\s](?:[^*]*[^*\s])?)(?P=stars)")
 _NONE = {"", "-", "--", "–", "—", "nan", "n/a"}
 
 
@@ -29,9 +30,9 @@ class Text:
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of plain text, the first line being the heading; ``**12.3**`` is bold. Caption and notes are markup.
+    """Cells of plain text, the first line being the heading; ``**12.3**`` is bold, ``*12.3*`` in italics.
 
-    Columns of numbers are set to the right. See :func:`with_best` for marking the best values.
+    Caption and notes are markup. Columns of numbers are set to the right. :func:`with_best` marks the best values.
     """
 
     lines: Sequence[Sequence[str]]
@@ -49,7 +50,7 @@ class Table:
     def numeric(self) -> list[bool]:
         """Of each column whether it holds numbers and nothing else (of blanks: no)."""
         columns = list(zip(*self.lines[1:], strict=True)) or [()] * len(self.lines[0])
-        return [_is_numeric([bare(cell) for cell in column]) for column in columns]
+        return [_is_numeric([cell_of(cell).text for cell in column]) for column in columns]
 
 
 @dataclass(frozen=True)
@@ -94,14 +95,27 @@ class Section:
     body: tuple[Block, ...]
 
 
-def bare(cell: str) -> str:
-    """A cell without the marks of a bold one."""
-    return cell[2:-2] if is_marked(cell) else cell
+@dataclass(frozen=True)
+class Cell:
+    """What a table's cell shows: its text, and whether it is bold (the best) or in italics (a paper's own number)."""
+
+    text: str
+    bold: bool = False
+    italic: bool = False
+
+    @property
+    def stars(self) -> str:
+        """The marks before and behind it."""
+        return "*" * (2 * self.bold + self.italic)
 
 
-def is_marked(cell: str) -> bool:
-    """Whether a cell is bold as a whole."""
-    return len(cell) > 4 and cell.startswith("**") and cell.endswith("**")
+def cell_of(cell: str) -> Cell:
+    """A cell with the marks taken off that stand around the whole of it."""
+    found = _MARKED.fullmatch(cell)
+    if not found:
+        return Cell(cell)
+    stars = len(found["stars"])
+    return Cell(found["text"], bold=stars > 1, italic=stars != 2)
 
 
 def with_best(
@@ -119,7 +133,7 @@ def with_best(
             if len(values) > 1:
                 best = max(values.values()) if highest else min(values.values())
                 for place in (place for place, value in values.items() if value == best):
-                    marked[place + 1][column] = f"**{bare(marked[place + 1][column])}**"
+                    marked[place + 1][column] = _bold(marked[place + 1][column])
     return marked
 
 
@@ -130,9 +144,14 @@ def _groups(lines: Sequence[Sequence[str]], column: int | None) -> list[list[int
     return list(found.values())
 
 
+def _bold(cell: str) -> str:
+    stars = replace(cell_of(cell), bold=True).stars
+    return f"{stars}{cell_of(cell).text}{stars}"
+
+
 def _value(cell: str) -> float | None:
     try:
-        return float(bare(cell).replace(",", ""))
+        return float(cell_of(cell).text.replace(",", ""))
     except ValueError:
         return None
 

@@ -22,8 +22,7 @@ from training.report_blocks import (
     Section,
     Table,
     Text,
-    bare,
-    is_marked,
+    cell_of,
 )
 from training.report_inline import inline_html, inline_text, markup_html
 from training.report_links import link_to
@@ -131,21 +130,24 @@ def _table(table: Table) -> str:
 
 
 def _class(table: Table, column: int) -> str:
-    """Numbers stand at the right; short words are not broken into two lines."""
+    """Numbers stand at the right; short words are not broken into two lines, and long ones have room."""
     if table.numeric[column]:
         return ' class="number"'
-    return ' class="short"' if all(len(line[column]) <= _SHORT for line in table.lines) else ""
+    short = all(len(line[column]) <= _SHORT for line in table.lines)
+    return ' class="short"' if short else ' class="long"'
 
 
 def _cell(cell: str, attributes: str, *, head: bool) -> str:
-    text = html.escape(bare(cell))
-    text = f"<strong>{text}</strong>" if is_marked(cell) else text
+    its = cell_of(cell)
+    text = html.escape(its.text)
+    text = f"<em>{text}</em>" if its.italic else text
+    text = f"<strong>{text}</strong>" if its.bold else text
     return f'<th scope="row"{attributes}>{text}</th>' if head else f"<td{attributes}>{text}</td>"
 
 
 def _begins_group(lines: Sequence[Sequence[str]]) -> list[bool]:
     """Of each line whether it begins a group, where lines of one group begin with the same word."""
-    firsts = [line[0] for line in lines]
+    firsts = [cell_of(line[0]).text for line in lines]
     grouped = any(one == other for one, other in pairwise(firsts))
     return [grouped and place > 0 and first != firsts[place - 1] for place, first in enumerate(firsts)]
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from training.report_blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, bare, is_marked
+from training.report_blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, cell_of
 from training.report_inline import inline_markdown, inline_text, markup_markdown, plain
 from training.report_links import link_to
 
@@ -48,13 +48,14 @@ def _table(table: Table) -> str:
     ]
     rule = "|" + "|".join("-" * (width + 1) + (":" if number else "-") for width, number in columns) + "|"
     drawn = "\n".join([texts[0], rule, *texts[1:]])
-    caption, notes = inline_markdown(table.caption), markup_markdown(table.notes)
+    caption = f"**{_plain(inline_text(table.caption))}**" if table.caption else ""
+    notes = markup_markdown(table.notes)
     return "\n\n".join(part for part in (caption, drawn, notes) if part)
 
 
 def _cell(cell: str) -> str:
-    text = _plain(bare(cell))
-    return f"**{text}**" if is_marked(cell) else text
+    its = cell_of(cell)
+    return f"{its.stars}{_plain(its.text)}{its.stars}"
 
 
 def _padded(cell: str, width: int, number: bool) -> str:

@@ -94,35 +94,40 @@ def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:
     commit, hardware = (provenance_of(out / "run").get(name) for name in ("git_commit", "hardware"))
     facts: dict[str, str | int | float | Code] = {"name": f"{record.name} ({record.kind})"}
     if noted:
-        facts["command"] = Code(_without_places(noted, out))
+        facts["command"] = Code(_shareable(noted, out))
     if record.kind == "workflow":
         again = ["python", script_name, "--recipe", f"{shown(out)}/recipe.yaml", "--out", "OUT"]
         facts["the same again"] = Code(shlex.join(again))
     facts["begun"] = moment(record.started)
-    facts["status"] = _status(record)
+    facts["status"] = _status(record, out)
     facts["commit" if commit else "commit of this report"] = Code(commit or this_commit())
     facts["versions"] = ", ".join(f"{name} {version}" for name, version in packages.items() if version)
     facts["machine" if hardware else "machine of this report"] = "; ".join((hardware or this_machine()).values())
     return facts
 
 
-def _status(record: Record) -> str:
+def _status(record: Record, out: Path) -> str:
+    """How it ended; of what still runs, as a workflow does while it writes its report, how its stages did."""
+    status, ended = record.status.lower(), record.ended
     if record.ended is None or record.status == "RUNNING":
-        return "still running when this report was written"
-    return f"{record.status.lower()} {moment(record.ended)}, after {duration((record.ended - record.started) / 1000)}"
+        stages = [stage for folder in _below(out) if (stage := read_record(folder))]
+        if not stages or any(stage.ended is None or stage.status != "FINISHED" for stage in stages):
+            return "still running when this report was written"
+        status, ended = "stages finished", max(stage.ended or 0 for stage in stages)
+    assert ended is not None
+    return f"{status} {moment(ended)}, {duration((ended - record.started) / 1000)} after it began"
 
 
-def _without_places(command: str, out: Path) -> str:
-    """A command whose absolute paths are cut to what they name: a report tells nothing of the machine's folders."""
-    named = command.replace(str(out.resolve()), shown(out))
+def _shareable(command: str, out: Path) -> str:
+    """A command without passwords in URLs, its absolute paths cut to what they name, so that it can be handed on."""
+    named = re.sub(r"://[^/@\s]+@", "://", command.replace(str(out.resolve()), shown(out)))
     return re.sub(r"(?<![\w.:/])/(?:[^\s'\"/]+/)+([^\s'\"/]+)", r"\1", named)
 
 
 def _stages(out: Path) -> Table:
     """A line for each record below ``out``, in the order of their beginnings."""
     lines = [["stage", "folder", "begun", "took", "status", "CPU %, mean", "memory GB, most", "GPU %, mean"]]
-    folders = [folder for folder in find_records(out) if folder != out.resolve()]
-    lines += [_stage(folder, out) for folder in folders]
+    lines += [_stage(folder, out) for folder in _below(out)]
     kept = [place for place in range(len(lines[0])) if place < 5 or any(line[place] for line in lines[1:])]
     return Table([[line[place] for place in kept] for line in lines], "Stages", _NOTES)
 
@@ -130,6 +135,10 @@ def _stages(out: Path) -> Table:
 _NOTES = """\
 *Took*: of the command that finished the stage, where that was noted, else from its first beginning to its end. Load is
 the whole machine's, every five seconds, other programs included."""
+
+
+def _below(out: Path) -> list[Path]:
+    return [folder for folder in find_records(out) if folder != out.resolve()]
 
 
 def _stage(folder: Path, out: Path) -> list[str]:
