@@ -5,13 +5,13 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from training.method_figures import ablation_figure, convergence_figure
-
 from datagen.generate import ray_runner
 from datagen.mesh import write_atomically
 from datagen.store import Dataset
+from training.ablation_figure import ablation_figure
 from training.batches import Batch, read_batch
 from training.checkpoint import require_checkpoint
+from training.convergence_figure import convergence_figure
 from training.evaluation import POSE_TYPES, Method, Row, evaluate, evaluation_list, write_rows
 from training.inference import load_trained
 from training.inference_time import Inference, measure_inference
