@@ -12,16 +12,33 @@ from training.evaluation import read_rows
 from training.record import read_record
 
 ROOT = Path(__file__).parents[2]
-SMALL = [
-    "--set", "data.body.family=leg", "data.body.rings=8", "data.body.segments=4", "data.identities.training=3",
-    "data.identities.evaluation=2", "data.poses.seen=6", "data.poses.unseen=4", "data.triples.count=5",
-    "training.steps=6", "training.evaluate_every=3", "training.batch=2", "training.log_every=1",
-    "evaluation.emd_points=16", "evaluation.examples=1",
-]  # fmt: skip
+LEGS = """
+description: legs
+recipe: smoke
+set: [data.identities.training=3, data.identities.evaluation=2, data.poses.seen=6, data.poses.unseen=4,
+      data.triples.count=5, training.steps=6, training.evaluate_every=3, training.batch=2, training.log_every=1,
+      evaluation.emd_points=16, evaluation.examples=1]
+methods:
+"""
+THREE = """\
+  - {name: DSFFNet, description: ours}
+  - {name: NPT, set: [training.network.name=npt, "training.network.encoder_widths=[8,8,13]"]}
+  - name: 3D-CoreNet
+    set: [training.network.name=corenet3d, "training.network.feature_widths=[8,8,16]",
+          "training.network.generator_widths=[16,16,8]", training.augmentation.shuffle=true]
+"""
+FOUR = """\
+  - {name: DSFFNet}
+  - {name: w/o FFAdaIN, set: [training.network.feature_fusion=false]}
+  - {name: w/o side target, set: [training.network.target_side=false]}
+  - {name: w/o L_edge, set: [training.edge_weight=0]}
+"""
 
 
-def run(script: str, out: Path, *words: str) -> str:
-    command = [sys.executable, f"workflows/{script}.py", "--out", str(out), *SMALL, *words]
+def run(script: str, out: Path, methods: str) -> str:
+    recipe = out.parent / f"{script}.yaml"
+    recipe.write_text(LEGS + methods)
+    command = [sys.executable, f"workflows/{script}.py", "--recipe", str(recipe), "--out", str(out)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=400, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -30,7 +47,7 @@ def run(script: str, out: Path, *words: str) -> str:
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("runs") / "compare"
-    return out, run("compare", out)
+    return out, run("compare", out, THREE)
 
 
 def test_every_method_and_no_op_is_measured_on_the_same_triples(compared: tuple[Path, str]) -> None:
@@ -71,7 +88,7 @@ def test_mlflow_shows_a_parent_its_trainings_and_the_evaluation(compared: tuple[
     client = mlflow.MlflowClient(f"sqlite:///{out / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("dsffnet").experiment_id])
     names = {run.info.run_name: run for run in runs}
-    parent = names["Comparison of methods: small"]
+    parent = names["Comparison of methods: compare"]
     children = {name for name, r in names.items() if r.data.tags.get("mlflow.parentRunId") == parent.info.run_id}
     assert children == {"generate", "DSFFNet", "NPT", "3D-CoreNet", "evaluate"}
     assert {"report.html", "report.md"} <= {item.path for item in client.list_artifacts(parent.info.run_id)}
@@ -81,13 +98,13 @@ def test_mlflow_shows_a_parent_its_trainings_and_the_evaluation(compared: tuple[
 def test_the_same_command_again_has_nothing_to_do(compared: tuple[Path, str]) -> None:
     out, _ = compared
     before = {path: path.stat().st_mtime_ns for path in (out / "evaluation").rglob("*") if path.is_file()}
-    said = run("compare", out)
+    said = run("compare", out, THREE)
     assert "trials: 3 of 3 skipped" in said and "evaluate: skipped" in said
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_an_ablation_trains_four_and_gives_table_three(tmp_path: Path) -> None:
-    said = run("ablation", tmp_path / "ablation")
+    said = run("ablation", tmp_path / "ablation", FOUR)
     assert "Table 3" in said and all(name in said for name in ("w/o FFAdaIN", "w/o side target", "w/o L_edge"))
     assert (tmp_path / "ablation" / "evaluation" / "figures" / "ablation.png").stat().st_size > 5000
     record = read_record(tmp_path / "ablation")
