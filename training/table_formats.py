@@ -18,7 +18,8 @@ THEIRS = "paper"
 """What the cell begins with that marks a line as a paper's own numbers."""
 
 STYLE = """\
-table.results {border-collapse: collapse; margin: 1.5em 0; font: 14px/1.4 system-ui, sans-serif; font-variant-numeric: tabular-nums}
+table.results {border-collapse: collapse; margin: 1.5em 0}
+table.results {font: 14px/1.4 system-ui, sans-serif; font-variant-numeric: tabular-nums}
 table.results caption {caption-side: top; text-align: left; font-weight: 600; padding: 0 0 .5em}
 table.results th, table.results td {padding: .25em .8em; text-align: right; white-space: nowrap; font-weight: 400}
 table.results th[scope=row], table.results .words {text-align: left}
