@@ -1,4 +1,4 @@
-"""Figures of several methods: layout, error colours on one scale, the best one marked, files that are whole or absent."""
+"""Figures of several methods: layout, errors on one scale, the best one marked, files that are whole or absent."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
