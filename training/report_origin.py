@@ -87,14 +87,15 @@ def duration(seconds: float) -> str:
 
 
 def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:
-    noted = record.tags.get(COMMAND_TAG)
+    command = record.tags.get(COMMAND_TAG)
     script = Path(record.tags.get("mlflow.source.name", "workflows/full.py"))
     script_name = f"{script.parent.name}/{script.name}" if script.suffix == ".py" else script.name
     packages = {name: _version(name) for name in _PACKAGES}
-    commit, hardware = (provenance_of(out / "run").get(name) for name in ("git_commit", "hardware"))
+    noted = next(filter(None, map(provenance_of, _below(out))), {})
+    commit, hardware = noted.get("git_commit"), noted.get("hardware")
     facts: dict[str, str | int | float | Code] = {"name": f"{record.name} ({record.kind})"}
-    if noted:
-        facts["command"] = Code(_shareable(noted, out))
+    if command:
+        facts["command"] = Code(_shareable(command, out))
     if record.kind == "workflow":
         again = ["python", script_name, "--recipe", f"{shown(out)}/recipe.yaml", "--out", "OUT"]
         facts["the same again"] = Code(shlex.join(again))
