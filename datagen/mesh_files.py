@@ -88,7 +88,7 @@ def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile
         raise MeshError(f"{path} cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
-        raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {_one_line(reason)}") from error
+        raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
     mesh = check_mesh(Mesh(vertices, faces), name=str(path))
     _require_thickness(vertices, path)
     return MeshFile(path, content.name or path.stem, mesh, component_count(vertices, faces), content)

@@ -58,7 +58,7 @@ class ObjContent:
     def _face_corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Numbers [corner, 3] of vertex, texture coordinate and normal (-1 for none), and corners of each face."""
         lines = self._of(b"f")
-        sizes = np.array([len(line.split()) - 1 for line in lines], np.int64)
+        sizes = np.array([len(_words(line)) - 1 for line in lines], np.int64)
         table = _written_corners(lines)
         line_of = np.repeat(np.array(self._at[b"f"], np.int64), sizes)
         for column, element in enumerate((b"v", b"vt", b"vn")):
@@ -102,8 +102,9 @@ class ObjContent:
         return written[numbers]
 
     def _colours(self) -> NDArray[np.uint8] | None:
-        rows = [_words(line) for line in self._of(b"v")]
-        if any(len(row) != 7 for row in rows):
+        lines = self._of(b"v")
+        rows = [_words(line) for line in lines] if lines and len(_words(lines[0])) == 7 else []
+        if not rows or any(len(row) != 7 for row in rows):
             return None
         written = _as_numbers([row[4:] for row in rows], 3)
         colours = np.clip(written / (255 if written.max(initial=0) > 1 else 1), 0, 1)
