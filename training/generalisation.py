@@ -185,7 +185,7 @@ def grid_table(
 
 
 def _cell(value: float, factor: float) -> str:
-    return f"{value * factor:.1f}" if np.isfinite(value) else "no truth"
+    return f"{value * factor:.1f}" if np.isfinite(value) else "–"
 
 
 def write_rows(rows: Sequence[GeneralisationRow], path: Path) -> None:

@@ -202,7 +202,7 @@ def methods_in(rows: Sequence[RobustnessRow]) -> list[str]:
 def limits_table(rows: Sequence[RobustnessRow]) -> str:
     """Markdown: for each disturbance the amount at which each method's PMD has doubled, and the PMD at the most."""
     names = methods_in(rows)
-    heads = [head for name in names for head in (f"{name}: PMD doubled at", "PMD at most")]
+    heads = [head for name in names for head in (f"{name}: doubled at", "PMD at the most")]
     lines = [["disturbance", "amount (unit)", *heads]]
     for disturbance in DISTURBANCES:
         curves = [curve(rows, name, disturbance.name) for name in names]

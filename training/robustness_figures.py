@@ -133,10 +133,10 @@ def disturbance_picture(
     page = [Row("source", [reference, *spoilt])]
     for number, method in enumerate(methods):
         whole = Panel(Mesh(standing(truth), case.truth.faces), ROLE_COLORS["truth"], "ground truth")
-        panels: list[Panel | None] = [None if number else whole]
+        panels: list[Panel | str] = ["" if number else whole]
         for (disturbance, _), source in zip(chosen, sources, strict=True):
             taken = not refusal(method, disturbance)
-            panels.append(_output(method, case, source) if taken else None)
+            panels.append(_output(method, case, source) if taken else "needs as many\nvertices as the target")
         page.append(Row(method.name.replace(" ", "\n", 1), panels))
     headings = ["", *(_heading(its, amount) for its, amount in chosen)]
     return mesh_grid(page, path, columns=headings, title=title, one_scale=False)
