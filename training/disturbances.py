@@ -104,20 +104,18 @@ def merge_cells(mesh: Mesh, amount: float, seed: int) -> Mesh:
     return Mesh(means, faces[(a != b) & (b != c) & (c != a)])
 
 
-def resample(mesh: Mesh, amount: float, seed: int) -> Mesh:
+def resample_by_area(mesh: Mesh, amount: float, seed: int) -> Mesh:
     """Replace the vertices by random points of the surface, even by area, ``amount`` times as many (0: as it was).
 
-    What is left is points without faces.
+    What is left is points without faces, as dense everywhere.
     """
-    if not amount:
-        return mesh
-    random, count = _random(seed), max(round(amount * len(mesh.vertices)), _FEWEST)
-    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    chosen = corners[random.choice(len(areas), count, p=areas / areas.sum())]
-    first, second = np.sqrt(random.random(count)), random.random(count)
-    weights = np.stack([1 - first, first * (1 - second), first * second], axis=1)  # uniform over a triangle
-    return Mesh((weights[:, :, None] * chosen).sum(axis=1), NO_FACES)
+    areas = _areas(mesh)
+    return _scattered(mesh, amount, seed, areas / areas.sum()) if amount else mesh
+
+
+def resample_by_face(mesh: Mesh, amount: float, seed: int) -> Mesh:
+    """As :func:`resample_by_area`, but with as many points on every face: dense where the mesh is dense."""
+    return _scattered(mesh, amount, seed, np.full(len(mesh.faces), 1 / len(mesh.faces))) if amount else mesh
 
 
 def subdivide(mesh: Mesh, amount: float, seed: int) -> Mesh:
@@ -147,6 +145,7 @@ def shift(mesh: Mesh, amount: float, seed: int) -> Mesh:
     return Mesh(mesh.vertices + amount * float(bounding_box(mesh.vertices).half), mesh.faces)
 
 
+_POINTS, _TIMES = "points / vertices", "{:g} times as many"
 _DEGREES = (0, 10, 20, 30, 45, 60, 90, 135, 180)
 
 DISTURBANCES: tuple[Disturbance, ...] = (
@@ -182,14 +181,10 @@ DISTURBANCES: tuple[Disturbance, ...] = (
         False,
     ),
     Disturbance(
-        "resample",
-        "Surface resampled",
-        "points / vertices",
-        "{:g} times as many",
-        (0, 0.25, 0.5, 1, 2, 4, 8),
-        resample,
-        False,
-        even=True,
+        "area", "Points by area", _POINTS, _TIMES, (0, 0.25, 0.5, 1, 2, 4, 8), resample_by_area, False, even=True
+    ),
+    Disturbance(
+        "face", "Points by face", _POINTS, _TIMES, (0, 0.25, 0.5, 1, 2, 4, 8), resample_by_face, False, even=True
     ),
     Disturbance("subdivide", "Subdivided", "times", "{:g} times", (0, 1, 2), subdivide, False),
     Disturbance("turn-x", "Turned about X", "degrees (leans)", "{:g}°", _DEGREES, turn("x")),
@@ -203,6 +198,21 @@ DISTURBANCES: tuple[Disturbance, ...] = (
 
 def _random(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
+
+
+def _areas(mesh: Mesh) -> NDArray[np.float64]:
+    """Twice the area [f] of every face."""
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
+    return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+
+
+def _scattered(mesh: Mesh, amount: float, seed: int, chances: NDArray[np.float64]) -> Mesh:
+    """Random points, evenly spread within faces that are drawn with the given chances [f]."""
+    random, count = _random(seed), max(round(amount * len(mesh.vertices)), _FEWEST)
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[random.choice(len(mesh.faces), count, p=chances)]]
+    first, second = np.sqrt(random.random(count)), random.random(count)
+    weights = np.stack([1 - first, first * (1 - second), first * second], axis=1)  # uniform over a triangle
+    return Mesh((weights[:, :, None] * corners).sum(axis=1), NO_FACES)
 
 
 def _along_edges(mesh: Mesh, *, start: int) -> NDArray[np.float64]:

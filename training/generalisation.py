@@ -5,20 +5,18 @@ the target's identity, in the target's own mesh, in the source's pose. Kinds wit
 picture is then all that can be shown.
 """
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import DatasetError
-from datagen.mesh import write_atomically
 from datagen.store import Dataset
 from training.evaluation import POSE_TYPES
 from training.robustness import NO_OP, Case, case_of
+from training.row_files import read_csv, write_csv
 from training.scores import Method, Score, mean_and_interval, normalised, transfer_each, values_of
 from training.tables import markdown
 
@@ -185,24 +183,14 @@ def grid_table(
 
 
 def _cell(value: float, factor: float) -> str:
-    return f"{value * factor:.1f}" if np.isfinite(value) else "no truth"
+    return f"{value * factor:.1f}" if np.isfinite(value) else "–"
 
 
 def write_rows(rows: Sequence[GeneralisationRow], path: Path) -> None:
     """Write rows as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(GeneralisationRow)])
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    write_atomically(path, text.getvalue().encode())
+    write_csv(rows, path, GeneralisationRow)
 
 
 def read_rows(path: Path) -> list[GeneralisationRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    if not path.exists():
-        return []
-    with open(path, encoding="utf-8") as file:
-        return [
-            GeneralisationRow(**{its.name: its.type(line[its.name]) for its in fields(GeneralisationRow)})  # type: ignore[operator]
-            for line in csv.DictReader(file)
-        ]
+    return read_csv(path, GeneralisationRow)

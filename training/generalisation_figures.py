@@ -45,8 +45,9 @@ def heat_map(
 ) -> Path:
     """Draw PMD (1e-4) from each kind of source (down) to each kind of target (across), one panel a method.
 
-    The last line is the no-op, the target unchanged. Grey: no ground truth is known. ``trained`` names the kind that
-    each method was trained on (empty: none of these), which is framed; colours are logarithmic and shared.
+    The last line is the no-op, the target unchanged. Grey: no ground truth is known, or the method takes no other
+    vertex count. ``trained`` names the kind that each method was trained on (empty: none of these), which is framed;
+    colours are logarithmic and shared.
 
     Raises
     ------
@@ -104,23 +105,23 @@ def generalisation_picture(
     return mesh_grid(page, path, columns=[*columns, "ground truth\n"], title=title, one_scale=False)
 
 
-def _panels(shown: Shown, methods: Sequence[Method]) -> list[Panel | None]:
+def _panels(shown: Shown, methods: Sequence[Method]) -> list[Panel | str]:
     case = shown.case
     size = float(bounding_box(case.target.vertices).half)  # a horse beside a person: each drawn as large as the other
     source = case.source.vertices * size / float(bounding_box(case.source.vertices).half)
-    found: list[Panel | None] = [
+    found: list[Panel | str] = [
         Panel(Mesh(standing(source), case.source.faces), ROLE_COLORS["source"], _count(case.source)),
         Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], _count(case.target)),
     ]
     found += [_output(shown, method) for method in methods]
     truth = Panel(Mesh(standing(case.truth.vertices), case.truth.faces), ROLE_COLORS["truth"])
-    return [*found, truth if shown.truth_known else None]
+    return [*found, truth if shown.truth_known else ""]
 
 
-def _output(shown: Shown, method: Method) -> Panel | None:
+def _output(shown: Shown, method: Method) -> Panel | str:
     case = shown.case
     if method.equal_counts and len(case.source.vertices) != len(case.target.vertices):
-        return None
+        return "needs as many\nvertices as the target"
     (output,) = transfer_each(method.network, [(case.source.vertices, case.target.vertices)])
     box = bounding_box(case.truth.vertices)
     vertices = standing(box.restore(output), case.truth.vertices if shown.truth_known else None)

@@ -34,10 +34,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class Row:
-    """Panels from left to right (None: left free) and the words at their left."""
+    """Panels from left to right and the words at their left; words in a panel's place say why there is none."""
 
     label: str
-    panels: Sequence[Panel | None]
+    panels: Sequence[Panel | str]
 
 
 def mesh_grid(
@@ -101,14 +101,18 @@ def drawable(mesh: MeshLike) -> Mesh:
 
 
 def _camera(rows: Sequence[Row], size: tuple[int, int]) -> Camera:
-    return frame([panel.mesh for row in rows for panel in row.panels if panel], size=size, margin=0.05)
+    return frame(
+        [panel.mesh for row in rows for panel in row.panels if isinstance(panel, Panel)], size=size, margin=0.05
+    )
 
 
 def _draw_row(page: "_Page", row: Row, camera: Camera, top: float, size: tuple[int, int]) -> None:
     for place, panel in enumerate(row.panels):
-        if panel is None:
+        left = _LABELS + place * size[0]
+        if isinstance(panel, str):
+            page.text(left + size[0] / 2, top + size[1] / 2, panel, size=6.5, color=QUIET, ha="center")
             continue
-        mesh, left = panel.mesh, _LABELS + place * size[0]
+        mesh = panel.mesh
         look: dict[str, Any] = {"colors": panel.colors, "camera": camera, "size": size, "background": PAGE}
         page.picture(render_mesh(mesh.vertices, mesh.faces, **look), left, top)
         page.text(left + size[0] / 2, top + size[1] + 8, panel.caption, size=6.5, color=QUIET, ha="center")

@@ -4,10 +4,8 @@ The source alone is disturbed, before its normalisation, as a person's mesh woul
 they are. The no-op ``target unchanged`` says what doing nothing would score, whatever the source.
 """
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -15,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import DatasetError
-from datagen.mesh import Mesh, bounding_box, write_atomically
+from datagen.mesh import Mesh, bounding_box
 from datagen.store import Dataset
 from training.disturbances import DISTURBANCES, Disturbance
 from training.evaluation import POSE_TYPES
+from training.row_files import read_csv, write_csv
 from training.scores import Method, Score, mean_and_interval, normalised, score, transfer_each, values_of
 from training.tables import markdown
 
@@ -202,7 +201,7 @@ def methods_in(rows: Sequence[RobustnessRow]) -> list[str]:
 def limits_table(rows: Sequence[RobustnessRow]) -> str:
     """Markdown: for each disturbance the amount at which each method's PMD has doubled, and the PMD at the most."""
     names = methods_in(rows)
-    heads = [head for name in names for head in (f"{name}: PMD doubled at", "PMD at most")]
+    heads = [head for name in names for head in (f"{name}: doubled at", "PMD at the most")]
     lines = [["disturbance", "amount (unit)", *heads]]
     for disturbance in DISTURBANCES:
         curves = [curve(rows, name, disturbance.name) for name in names]
@@ -242,19 +241,9 @@ def _cells(pmd: Sequence[Level], millimetres: Sequence[Level], amount: float) ->
 
 def write_rows(rows: Sequence[RobustnessRow], path: Path) -> None:
     """Write rows as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(RobustnessRow)])
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    write_atomically(path, text.getvalue().encode())
+    write_csv(rows, path, RobustnessRow)
 
 
 def read_rows(path: Path) -> list[RobustnessRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    if not path.exists():
-        return []
-    with open(path, encoding="utf-8") as file:
-        return [
-            RobustnessRow(**{its.name: its.type(line[its.name]) for its in fields(RobustnessRow)})  # type: ignore[operator]
-            for line in csv.DictReader(file)
-        ]
+    return read_csv(path, RobustnessRow)

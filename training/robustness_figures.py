@@ -18,7 +18,7 @@ from training.robustness import Case, RobustnessRow, curve, disturbed, methods_i
 from training.scores import Method, transfer_each
 
 METHOD_COLORS = ("#d1462f", "#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")
-_ABREAST = 4
+_ABREAST = 5
 _BODY_METRES = 1.7
 
 
@@ -46,7 +46,7 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
         axes.set_ylabel("PMD (1e-4)", fontsize=7.5, color=INK)
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.suptitle(title, fontsize=9, weight="bold", color=INK, x=0.01, ha="left", parse_math=False)
-    place = {"loc": "outside lower left", "ncols": 4, "frameon": False}
+    place = {"loc": "outside lower left", "ncols": 7, "frameon": False}
     figure.legend(handles, names, fontsize=7.5, labelcolor=INK, **place)
     return saved(figure, path)
 
@@ -133,10 +133,10 @@ def disturbance_picture(
     page = [Row("source", [reference, *spoilt])]
     for number, method in enumerate(methods):
         whole = Panel(Mesh(standing(truth), case.truth.faces), ROLE_COLORS["truth"], "ground truth")
-        panels: list[Panel | None] = [None if number else whole]
+        panels: list[Panel | str] = ["" if number else whole]
         for (disturbance, _), source in zip(chosen, sources, strict=True):
             taken = not refusal(method, disturbance)
-            panels.append(_output(method, case, source) if taken else None)
+            panels.append(_output(method, case, source) if taken else "needs as many\nvertices as the target")
         page.append(Row(method.name.replace(" ", "\n", 1), panels))
     headings = ["", *(_heading(its, amount) for its, amount in chosen)]
     return mesh_grid(page, path, columns=headings, title=title, one_scale=False)
@@ -175,7 +175,7 @@ def noise_levels() -> list[tuple[Disturbance, float]]:
 def one_of_each() -> list[tuple[Disturbance, float]]:
     """A telling amount of every disturbance that changes the source's shape or stance."""
     amounts = {
-        "patch": 0.3, "side": 0.6, "subset": 0.75, "cells": 0.15, "resample": 4, "turn-x": 30, "turn-y": 45,
+        "patch": 0.3, "side": 0.6, "subset": 0.75, "cells": 0.15, "area": 4, "face": 4, "turn-x": 30, "turn-y": 45,
         "turn-z": 30,
     }  # fmt: skip
     return [(its, amounts[its.name]) for its in DISTURBANCES if its.name in amounts]

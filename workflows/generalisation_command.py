@@ -204,6 +204,7 @@ def report(
         "triples). All Anny kinds are the same people; the stand-in in SMPL's format has people of its own in the same "
         "poses; animals have poses of their own, so that between them and people there is no ground truth. PMD: mean "
         "over vertices and coordinates of (output - truth)^2 in the normalised box; mm: mean distance of a vertex. "
-        "Pairs down to across: source to target.\n\n![heat map](heat-map.png)\n\n![examples](examples.png)\n\n"
+        "Pairs down to across: source to target; –: no ground truth is known, or the network takes "
+        "no other vertex count.\n\n![heat map](heat-map.png)\n\n![examples](examples.png)\n\n"
         f"{grids}\n"
     )

@@ -147,23 +147,32 @@ def report(
     cases: int,
 ) -> str:
     """The study as Markdown: what was done, where it breaks, every number."""
-    left_out = [
-        f"- {method.name} without {its.heading.lower()}: {refusal(method, its)}."
-        for method in methods
-        for its in disturbances
-        if refusal(method, its)
-    ]
+    left_out = [_left_out(method, disturbances) for method in methods]
+    start = ", ".join(f"{its.name} {_undisturbed(rows, its):.2f}" for its in methods)
     trained = "; ".join(f"{method.name}: step {method.step:,}" for method in methods)
     return (
         f"# Robustness to a disturbed source\n\nWeights: {trained}. Dataset {data}, its first {cases} evaluation "
         f"triples of new identities. Only the source is changed, before its normalisation; ground truth and target "
         f"stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, times 1e4. "
-        f"Returning the target unchanged scores {no_op(rows) * 1e4:.2f}. Amounts in half box edges: 0.01 is "
-        f"{millimetres(0.01):.1f} mm on a body of 1.7 m.\n\n"
-        f"## Where it breaks\n\n{limits_table(rows)}\n\n" + "\n".join([*left_out, ""] if left_out else []) + "\n"
-        f"![curves](curves.png)\n\n![noise](noise.png)\n\n![disturbances](disturbances.png)\n\n"
+        f"Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
+        f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m.\n\n"
+        f"## Where it breaks\n\n{limits_table(rows)}\n\n"
+        + "".join(left_out)
+        + f"![curves](curves.png)\n\n![noise](noise.png)\n\n![disturbances](disturbances.png)\n\n"
         f"## Every amount\n\nMean over triples; +- is the half width of its 95 % interval.\n\n{amounts_table(rows)}\n"
     )
+
+
+def _left_out(method: Method, disturbances: Sequence[Disturbance]) -> str:
+    """A line that says what a method could not take, and why."""
+    refused = [its for its in disturbances if refusal(method, its)]
+    names = ", ".join(its.heading.lower() for its in refused)
+    return f"- {method.name} without {names}: {refusal(method, refused[0])}.\n\n" if refused else ""
+
+
+def _undisturbed(rows: Sequence[RobustnessRow], method: Method) -> float:
+    levels = [curve(rows, method.name, its.name) for its in DISTURBANCES]
+    return next(its[0].mean * 1e4 for its in levels if its)
 
 
 def _count(rows: Sequence[RobustnessRow]) -> int:

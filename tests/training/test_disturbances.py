@@ -94,11 +94,18 @@ def test_the_side_that_is_cut_is_the_one_towards_x() -> None:
 
 def test_points_of_a_resampled_surface_lie_on_it_evenly() -> None:
     mesh = tube(rings=6, segments=64)
-    points = BY_NAME["resample"].apply(mesh, 8, 2).vertices
+    points = BY_NAME["area"].apply(mesh, 8, 2).vertices
     assert len(points) == 8 * len(mesh.vertices)
     radius = np.linalg.norm(points[:, 1:] - (1, -2), axis=1)
     assert (radius > 0.299).all() and (radius < 0.3 + 1e-9).all()
     assert np.histogram(points[:, 0] - 5, bins=4, range=(0, 2))[0] == pytest.approx(len(points) / 4, rel=0.1)
+
+
+def test_points_by_face_are_as_many_on_every_face_and_by_area_are_not() -> None:
+    large, small = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[10, 0, 0], [11, 0, 0], [10, 1, 0]])
+    mesh = Mesh(np.concatenate([large, small]).astype(float), np.array([[0, 1, 2], [3, 4, 5]]))
+    shares = [(BY_NAME[name].apply(mesh, 1000, 1).vertices[:, 0] >= 10).mean() for name in ("face", "area")]
+    assert shares == pytest.approx([1 / 2, 1 / 17], abs=0.02)
 
 
 def test_subdivision_keeps_the_surface_and_quarters_the_faces() -> None:

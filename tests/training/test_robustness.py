@@ -143,7 +143,7 @@ def test_curves_and_picture_are_drawn(tmp_path: Path, dataset: str, method: Meth
     with Image.open(robustness_curves(rows, tmp_path / "curves.png", title="tiny")) as picture:
         colors = np.asarray(picture.convert("RGB")).reshape(-1, 3)
         assert (np.abs(colors.astype(int) - (209, 70, 47)).sum(1) < 12).sum() > 200, "the method's line is there"
-    chosen: list[tuple[Disturbance, float]] = [(BY_NAME["noise"], 0.1), (BY_NAME["resample"], 1)]
+    chosen: list[tuple[Disturbance, float]] = [(BY_NAME["noise"], 0.1), (BY_NAME["area"], 1)]
     (case,) = cases_of(open_dataset(dataset), 1)
     path = disturbance_picture(case, [method], chosen, tmp_path / "noise.png", title="a title " * 20)
     with Image.open(path) as picture:
