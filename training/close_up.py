@@ -1,6 +1,6 @@
 """Close-ups of the place where methods differ most, and the frame that marks it in the whole picture."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,20 +25,22 @@ class CloseUp:
     reach: float
 
     @classmethod
-    def of(cls, truth: Solid, errors: Mapping[str, Floats]) -> "CloseUp":
-        """Where the errors [v] of the worst and the best method differ most, on average over the surroundings.
+    def of(cls, truth: Solid, outputs: Sequence[Solid]) -> "CloseUp":
+        """Where the errors of the worst and the best output differ most, on average over the surroundings.
 
-        Places that a method has moved out of the close-up are left out, unless all are.
+        Its centre is the middle of what the truth and all outputs have there. Places that an output has moved out of
+        a close-up are left out, unless all are.
         """
-        found = np.stack(list(errors.values()))
+        every = np.stack([truth.vertices, *(mesh.vertices for mesh in outputs)])
+        errors = np.linalg.norm(every[1:] - every[0], axis=2)
         size = max(float(np.ptp(truth.vertices, axis=0).max()), 1e-12)
-        every = np.unique(np.linspace(0, len(truth.vertices) - 1, _CANDIDATES).astype(int))
-        around = cKDTree(truth.vertices).query_ball_point(truth.vertices[every], _AROUND * size)
-        difference, worst = np.ptp(found, axis=0), found.max(0)
+        places = np.unique(np.linspace(0, len(truth.vertices) - 1, _CANDIDATES).astype(int))
+        around = cKDTree(truth.vertices).query_ball_point(truth.vertices[places], _AROUND * size)
+        difference, worst = np.ptp(errors, axis=0), errors.max(0)
         score = np.array([difference[near].mean() for near in around])
         inside = np.array([worst[near].max() for near in around]) < _REACH * size
         score = np.where(inside, score, -1.0) if inside.any() else score
-        return cls(truth.vertices[every[score.argmax()]], _REACH * size)
+        return cls(every[:, around[score.argmax()]].mean((0, 1)), _REACH * size)
 
     def camera(self, camera: Camera) -> Camera:
         """The same eye, turned to the place and zoomed in."""

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from training.camera import Camera
 from training.close_up import CloseUp, close_up_size, outlined
-from training.comparison import Comparison, Solid, camera_of, in_view, output_of, vertex_errors
+from training.comparison import Comparison, Solid, camera_of, in_view, output_of
 from training.figure_style import PAGE
 from training.palette import ROLE_COLORS, error_colors
 from training.rasteriser import Floats
@@ -87,7 +87,7 @@ class ShownRow:
             place: self.heat(method, camera, columns.panel, limit) for place, method in enumerate(columns.methods, 2)
         }
         if columns.stacked and columns.close_ups and len(self.errors) > 1:
-            near = CloseUp.of(self.meshes["truth"], vertex_errors(self.comparison))
+            near = CloseUp.of(self.meshes["truth"], [self.meshes[output_of(method)] for method in self.errors])
             marked = {place: _marked(name, meshes[place], near, camera) for place, name in enumerate(columns.names)}
             return [Strip.of(marked), Strip.of(heats), self._close_ups(columns, near.camera(camera))]
         if columns.stacked:

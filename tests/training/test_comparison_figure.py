@@ -206,11 +206,16 @@ def strip(count: int = 200) -> Solid:
 
 
 def test_the_close_up_is_where_methods_differ_not_where_all_are_wrong_nor_where_one_has_left_it() -> None:
-    x = strip().vertices[:, 0]
-    both_wrong, differ, gone = (np.abs(x - place) < 0.06 for place in (0.1, 0.5, 0.9))
-    errors = {"a": 0.1 * both_wrong + 0.05 * differ + 3.0 * gone, "b": 0.1 * both_wrong}
-    assert CloseUp.of(strip(), errors).centre[0] == pytest.approx(0.5, abs=0.05)
-    assert CloseUp.of(strip(), {"a": 3.0 + gone, "b": 3.0 + 0 * x}).centre[0] == pytest.approx(0.9, abs=0.06)
+    truth = strip()
+    both_wrong, differ, gone = (np.abs(truth.vertices[:, 0] - place) < 0.06 for place in (0.1, 0.5, 0.9))
+
+    def off_by(error: Floats) -> Solid:
+        return Solid(truth.vertices + error[:, None] * (0, 0, 1), truth.faces)
+
+    outputs = [off_by(0.1 * both_wrong + 0.05 * differ + 3.0 * gone), off_by(0.1 * both_wrong)]
+    assert CloseUp.of(truth, outputs).centre[0] == pytest.approx(0.5, abs=0.05)
+    all_gone = CloseUp.of(truth, [off_by(3.0 + gone), off_by(3.0 + 0 * gone)]).centre
+    assert all_gone[0] == pytest.approx(0.9, abs=0.06) and all_gone[2] == pytest.approx(2.3, abs=0.15)
 
 
 def test_the_mark_in_the_whole_picture_is_what_the_close_up_shows() -> None:
