@@ -1,35 +1,19 @@
 """Figures 5, 6 and 7 of the DSFFNet paper: several methods on the same transfers, side by side, with their errors."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from training.camera import Camera
-from training.comparison import (
-    Comparison,
-    ErrorScale,
-    Solid,
-    best_of,
-    camera_of,
-    in_view,
-    methods_in,
-    output_of,
-    placed,
-)
-from training.figure_style import INK, PAGE, QUIET, RULE, saved
+from training.comparison import Comparison, ErrorScale, best_of, methods_in, placed
+from training.comparison_panels import SIDE, Columns, ShownRow, Strip, panel_size
+from training.figure_style import INK, QUIET, RULE, saved
 from training.page import Page
-from training.palette import ROLE_COLORS, error_colors, method_colors
-from training.rasteriser import Floats
-from training.rendering import render_mesh
+from training.palette import method_colors
 
-_SIDE, _HEAD, _TITLE, _UNDER, _FOOT = 20, 100, 46, 30, 112  # pixels: margin, heading, title, metrics, colour bar
-_AIR = 8  # pixels left free above and below what a strip shows
-_WIDTH = 312  # of a panel by default: five of them make a figure of 1600 pixels
-Picture = npt.NDArray[np.uint8]
+_HEAD, _TITLE, _UNDER, _FOOT = 100, 46, 30, 112  # pixels: heading, title, metrics, colour bar
 _MEANING = {
     "source": ("Source", "gives the pose"),
     "target": ("Target", "gives the identity"),
@@ -44,6 +28,7 @@ def comparison_figure(
     *,
     error_scale: ErrorScale | None = None,
     panel: tuple[int, int] | None = None,
+    close_ups: bool = False,
 ) -> Path:
     """Draw source, target, each method's output and the ground truth of each transfer as one row, with the errors.
 
@@ -60,6 +45,8 @@ def comparison_figure(
         Unit of the colour bar; by default centimetres for vertices in metres.
     panel : (int, int), optional
         Width and height of a panel in pixels; by default 312 wide and as high as the meshes need.
+    close_ups : bool
+        Whether several methods and the truth are shown near by too, where the methods differ most.
 
     Raises
     ------
@@ -69,112 +56,20 @@ def comparison_figure(
     if not rows:
         raise ValueError("comparison_figure needs at least one example")
     scale = error_scale or ErrorScale()
-    solid = [_Row(row, placed(row), scale.of(row)) for row in rows]
-    columns = _Columns(methods_in(rows), panel or _panel(solid), any(row.errors for row in solid))
+    solid = [ShownRow(row, placed(row), scale.of(row)) for row in rows]
+    columns = Columns(methods_in(rows), panel or panel_size(solid), any(row.errors for row in solid), close_ups)
     about = _Errors(scale.unit, scale.resolved(rows), max(row.largest_mean for row in solid))
     drawn = [row.strips(columns, about.limit) for row in solid]
-    heights = [_TITLE + sum(strip.height for strip in strips) + columns.under for strips in drawn]
-    page = Page(width=columns.left(len(columns.names)) + _SIDE, height=_HEAD + sum(heights) + columns.foot)
+    under = _UNDER if len(columns.methods) > 1 else 0
+    heights = [_TITLE + sum(strip.height for strip in strips) + under for strips in drawn]
+    foot = _FOOT if columns.errors else 12
+    page = Page(width=columns.left(len(columns.names)) + SIDE, height=_HEAD + sum(heights) + foot)
     _draw_headings(page, columns)
     for row, strips, top in zip(solid, drawn, np.cumsum([_HEAD, *heights]).tolist(), strict=False):
         _draw_row(page, columns, top, row, strips, about)
     if columns.errors:
         _draw_foot(page, columns, about)
     return saved(page.figure, path)
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """Which columns there are, and their panels. Errors of several methods have a strip of their own below."""
-
-    methods: Sequence[str]
-    panel: tuple[int, int]
-    errors: bool
-
-    @property
-    def stacked(self) -> bool:
-        return self.errors and len(self.methods) > 1
-
-    @property
-    def names(self) -> list[str]:
-        """The meshes of the first strip, from left to right; ``error`` is the error of the only method."""
-        end = ["truth"] if self.errors else []
-        beside = ["error"] if self.errors and not self.stacked else []
-        return ["source", "target", *map(output_of, self.methods), *end, *beside]
-
-    @property
-    def under(self) -> int:
-        """Height of the words below a row."""
-        return _UNDER if len(self.methods) > 1 else 0
-
-    @property
-    def foot(self) -> int:
-        return _FOOT if self.errors else 12
-
-    def left(self, column: int) -> int:
-        return _SIDE + column * self.panel[0]
-
-    def middle(self, column: int) -> float:
-        return self.left(column) + self.panel[0] / 2
-
-
-@dataclass(frozen=True)
-class _Strip:
-    """Pictures by column, all cut to the rows of pixels in which any of them shows something."""
-
-    pictures: Mapping[int, Picture]
-    height: int
-
-    @classmethod
-    def of(cls, pictures: Mapping[int, Picture | None]) -> "_Strip":
-        drawn = {column: picture for column, picture in pictures.items() if picture is not None}
-        if not drawn:
-            return cls({}, 0)
-        shown = np.flatnonzero(np.any([(picture < 250).any((1, 2)) for picture in drawn.values()], axis=0))
-        first, last = (int(shown[0]), int(shown[-1])) if len(shown) else (0, 0)
-        rows = slice(max(first - _AIR, 0), last + 1 + _AIR)
-        cut = {column: picture[rows] for column, picture in drawn.items()}
-        return cls(cut, len(next(iter(cut.values()))))
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A comparison, its placed meshes, and each method's errors [v] in the unit of the colour bar."""
-
-    comparison: Comparison
-    meshes: Mapping[str, Solid]
-    errors: Mapping[str, Floats]
-
-    @property
-    def largest_mean(self) -> float:
-        return max((float(errors.mean()) for errors in self.errors.values()), default=0.0)
-
-    def strips(self, columns: _Columns, limit: float) -> list[_Strip]:
-        """The meshes and, where they have a strip of their own, the errors."""
-        camera = camera_of(self.meshes, columns.panel)
-        meshes = {place: self.picture(name, camera, columns.panel) for place, name in enumerate(columns.names)}
-        heats = {
-            place: self.heat(method, camera, columns.panel, limit) for place, method in enumerate(columns.methods, 2)
-        }
-        if columns.stacked:
-            return [_Strip.of(meshes), _Strip.of(heats)]
-        return [_Strip.of({**meshes, len(columns.names) - 1: heats[2]} if columns.errors else meshes)]
-
-    def picture(self, column: str, camera: Camera, size: tuple[int, int]) -> Picture | None:
-        """The mesh of a column in the colour of its role; None where there is none."""
-        if column not in self.meshes:
-            return None
-        mesh, color = self.meshes[column], ROLE_COLORS[column.partition(" ")[0]]
-        return render_mesh(mesh.vertices, mesh.faces, colors=color, camera=camera, size=size, background=PAGE)
-
-    def heat(self, method: str, camera: Camera, size: tuple[int, int], limit: float) -> Picture | None:
-        """A method's output in the colours of its errors; None where there are none."""
-        if method not in self.errors:
-            return None
-        mesh, colors = self.meshes[output_of(method)], error_colors(self.errors[method], limit)
-        return render_mesh(
-            mesh.vertices, mesh.faces, colors=colors, camera=camera, size=size, background=PAGE, shading=0.55
-        )
 
 
 @dataclass(frozen=True)
@@ -186,14 +81,7 @@ class _Errors:
     largest_mean: float
 
 
-def _panel(rows: Sequence[_Row]) -> tuple[int, int]:
-    """Panels as high as most rows need: tall for people, low for dogs."""
-    extents = [high - low for _, low, high in (in_view(row.meshes) for row in rows)]
-    shape = np.median([extent[1] / max(extent[0], 1e-12) for extent in extents])
-    return _WIDTH, round(_WIDTH * float(np.clip(shape, 0.7, 1.3)))
-
-
-def _draw_headings(page: Page, columns: _Columns) -> None:
+def _draw_headings(page: Page, columns: Columns) -> None:
     colors, several = method_colors(columns.methods), len(columns.methods) > 1
     for column, name in enumerate(columns.names):
         method = name.removeprefix("output ")
@@ -205,38 +93,38 @@ def _draw_headings(page: Page, columns: _Columns) -> None:
             page.block(columns.left(column) + 16, _HEAD - 14, columns.panel[0] - 32, 6, colors[method])
 
 
-def _draw_row(page: Page, columns: _Columns, top: int, row: _Row, strips: Sequence[_Strip], about: _Errors) -> None:
+def _draw_row(page: Page, columns: Columns, top: int, row: ShownRow, strips: Sequence[Strip], about: _Errors) -> None:
     words = row.comparison.metrics.get(columns.methods[0], "") if len(columns.methods) == 1 else ""
     page.rule(top)
-    page.text(_SIDE + 4, top + 26, row.comparison.title, size=7.5, room=page.width - 48)
+    page.text(SIDE + 4, top + 26, row.comparison.title, size=7.5, room=page.width - 48)
     page.text(page.width - 24, top + 26, words, size=7.5, color=QUIET, anchor="right")
-    top += _TITLE
+    begin = top = top + _TITLE
     for strip in strips:
         for column, picture in strip.pictures.items():
             page.picture(picture, columns.left(column), top)
         top += strip.height
     if columns.stacked and row.errors:
-        _draw_bars(page, columns, top - strips[1].height / 2, row, about)
+        _draw_bars(page, columns, begin + strips[0].height + strips[1].height / 2, row, about)
     if len(columns.methods) > 1:
         _draw_metrics(page, columns, top + 8, row)
 
 
-def _draw_bars(page: Page, columns: _Columns, middle: float, row: _Row, about: _Errors) -> None:
+def _draw_bars(page: Page, columns: Columns, middle: float, row: ShownRow, about: _Errors) -> None:
     """Draw the mean error of each method as a bar beside the heat maps; bars have one scale in the whole figure."""
     colors, best = method_colors(columns.methods), best_of(row.errors)
-    start, reach, step = _SIDE + 0.78 * columns.panel[0], 0.9 * columns.panel[0], 42.0
+    start, reach, step = SIDE + 0.78 * columns.panel[0], 0.9 * columns.panel[0], 42.0
     top = middle - step * len(row.errors) / 2 + 14
     page.text(start, top - 20, f"mean error of a vertex ({about.unit})", size=6.5, color=QUIET)
     for place, (method, errors) in enumerate(row.errors.items()):
         mean, y = float(errors.mean()), top + (place + 0.5) * step
         length, weight = reach * mean / max(about.largest_mean, 1e-12), "bold" if method == best else "normal"
-        page.text(start - 10, y, method, size=7, anchor="right", weight=weight, room=start - _SIDE - 12)
+        page.text(start - 10, y, method, size=7, anchor="right", weight=weight, room=start - SIDE - 12)
         page.block(start, y - 0.3 * step, max(length, 1.5), 0.6 * step, colors[method])
         page.text(start + length + 8, y, f"{mean:.3g}", size=7, weight=weight)
     page.block(start - 1, top, 1, step * len(row.errors), RULE)
 
 
-def _draw_metrics(page: Page, columns: _Columns, y: float, row: _Row) -> None:
+def _draw_metrics(page: Page, columns: Columns, y: float, row: ShownRow) -> None:
     """Write each method's numbers under its panels."""
     best = best_of(row.errors)
     for column, method in enumerate(columns.methods, start=2):
@@ -245,7 +133,7 @@ def _draw_metrics(page: Page, columns: _Columns, y: float, row: _Row) -> None:
         page.text(columns.middle(column), y, words, size=7, anchor="center", weight=weight, color=color, room=room)
 
 
-def _draw_foot(page: Page, columns: _Columns, about: _Errors) -> None:
+def _draw_foot(page: Page, columns: Columns, about: _Errors) -> None:
     """Draw the colour bar below the last heat map."""
     page.rule(page.height - _FOOT + 8)
     column = 1 + len(columns.methods) if columns.stacked else len(columns.names) - 1

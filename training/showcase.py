@@ -50,9 +50,10 @@ def examples_of(dataset: Dataset, network: nn.Module, recipe: EvaluationRecipe, 
 def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: str) -> None:
     """Write figures/examples.png, viewer.html, and meshes/NN-ROLE.glb of each; an output is NN-output-METHOD.glb.
 
-    Of a single method it is NN-output.glb.
+    Of a single method it is NN-output.glb; several are also shown near by.
     """
-    comparison_figure(comparisons, folder / "figures" / "examples.png")
+    several = any(len(comparison.outputs) > 1 for comparison in comparisons)
+    comparison_figure(comparisons, folder / "figures" / "examples.png", close_ups=several)
     write_viewer(comparisons, folder / "viewer.html", title=title)
     for number, comparison in enumerate(comparisons):
         for name, mesh in comparison.meshes().items():

@@ -9,6 +9,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from training import comparison_figure as module
+from training.camera import Camera
+from training.close_up import CloseUp
 from training.comparison import Comparison, ErrorScale, best_of, camera_of, methods_in, placed, vertex_errors
 from training.comparison_figure import comparison_figure
 from training.palette import ERROR_COLORS, METHOD_COLORS, error_colors, method_colors
@@ -194,6 +196,54 @@ def test_a_long_body_is_seen_from_the_side_whatever_a_broken_output_looks_like()
     assert np.degrees(np.arctan2(turn[0], turn[2])) == pytest.approx(62)
     upright = camera_of(placed(comparison(ours=0.0))).axes()[2]
     assert np.degrees(np.arctan2(upright[0], upright[2])) == pytest.approx(28)
+
+
+def strip(count: int = 200) -> Solid:
+    """A thin strip of triangles along x, from 0 to 1."""
+    x = np.repeat(np.linspace(0, 1, count), 2)
+    points = np.stack([x, 0.01 * (np.arange(2 * count) % 2), np.zeros(2 * count)], 1)
+    return Solid(points, np.stack([np.arange(2 * count - 2) + k for k in range(3)], 1))
+
+
+def test_the_close_up_is_where_methods_differ_not_where_all_are_wrong_nor_where_one_has_left_it() -> None:
+    truth = strip()
+    both_wrong, differ, gone = (np.abs(truth.vertices[:, 0] - place) < 0.06 for place in (0.1, 0.5, 0.9))
+
+    def off_by(error: Floats) -> Solid:
+        return Solid(truth.vertices + error[:, None] * (0, 0, 1), truth.faces)
+
+    outputs = [off_by(0.1 * both_wrong + 0.05 * differ + 3.0 * gone), off_by(0.1 * both_wrong)]
+    assert CloseUp.of(truth, outputs).centre[0] == pytest.approx(0.5, abs=0.05)
+    all_gone = CloseUp.of(truth, [off_by(3.0 + gone), off_by(3.0 + 0 * gone)]).centre
+    assert all_gone[0] == pytest.approx(0.9, abs=0.06) and all_gone[2] == pytest.approx(2.3, abs=0.15)
+
+
+def test_the_mark_in_the_whole_picture_is_what_the_close_up_shows() -> None:
+    whole = Camera(eye=(0.5, 0, 5), target=(0.5, 0, 0), field_of_view=20)
+    near = CloseUp(np.array([0.7, 0.1, 0.0]), 0.1)
+    marked = near.marked(np.full((200, 400, 3), 255, np.uint8), whole)
+    rows, columns = np.nonzero((marked < 255).any(-1))
+    pixel = 2 * 5 * np.tan(np.radians(10)) / 200
+    assert (rows.min() + rows.max()) / 2 == pytest.approx(100 - 0.1 / pixel, abs=1)
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(200 + 0.2 / pixel, abs=1)
+    assert np.ptp(rows) == pytest.approx(0.2 / pixel, abs=2) and np.ptp(columns) == pytest.approx(
+        0.8 / 3 / pixel, abs=2
+    )
+    seen = near.camera(whole)
+    away = np.linalg.norm(np.subtract(seen.eye, seen.target))
+    assert seen.eye == whole.eye and np.tan(np.radians(seen.field_of_view / 2)) * away == pytest.approx(0.1)
+
+
+def test_close_ups_add_a_strip_with_the_truth_beside_the_methods(tmp_path: Path) -> None:
+    rows = [comparison(a=0.1, b=0.2)]
+    plain, more = (
+        pixels(comparison_figure(rows, tmp_path / f"{near}.png", panel=PANEL, close_ups=near)) for near in (False, True)
+    )
+    added = more.shape[0] - plain.shape[0]
+    assert added > 60 and more.shape[1] == plain.shape[1]
+    below = slice(-112 - 30 - added + 12, -112 - 42)
+    inked = [(column(more, number)[below] < 240).mean() for number in range(5)]
+    assert max(inked[:2]) == 0 and min(inked[2:]) > 0.05
 
 
 def test_names_are_not_taken_for_mathematics(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.generate import generate
-from datagen.mesh import load_mesh
+from datagen.mesh import bounding_box, load_mesh
 from datagen.store import Dataset, open_dataset
 from tests.support.mixed import mixed_dataset
 from tests.support.recipes import tiny_training
@@ -62,6 +62,14 @@ def test_outputs_are_in_metres_in_the_box_of_the_truth(dataset: str) -> None:
     assert one.truth is not None
     sizes = [np.ptp(mesh.vertices, axis=0).max() for mesh in (one.truth, *one.outputs.values())]
     assert sizes[1] == pytest.approx(sizes[0], rel=1e-5) and sizes[2] == pytest.approx(sizes[0] / 2, rel=1e-5)
+
+
+def test_each_output_is_that_of_its_own_triple(dataset: str) -> None:
+    for one in shown(open_dataset(dataset), ours=1.0):
+        assert one.truth is not None
+        inside = [bounding_box(np.asarray(mesh.vertices)).normalise(mesh.vertices) for mesh in (one.target, one.truth)]
+        output = bounding_box(np.asarray(one.truth.vertices)).normalise(one.outputs["ours"].vertices)
+        assert output == pytest.approx(inside[0], abs=1e-5) and not np.allclose(output, inside[1], atol=1e-2)
 
 
 def test_a_method_without_rows_has_a_picture_and_no_numbers(dataset: str) -> None:
