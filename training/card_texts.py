@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from datagen.grid import Split
 from datagen.recipe import Body, MixedBody
 from datagen.store import Dataset
 
@@ -112,9 +113,11 @@ def name_of(dataset: Dataset) -> str:
     return dataset.url.rstrip("/").rsplit("/", 1)[-1]
 
 
-def vertex_counts(dataset: Dataset) -> list[int]:
-    """Vertices of each identity."""
-    return [dataset.vertex_count(identity) for identity in range(dataset.grid.identity_count)]
+def vertex_counts(dataset: Dataset, split: Split | None = None) -> list[int]:
+    """Vertices of each identity; of those of one split alone, where there are any."""
+    everyone = range(dataset.grid.identity_count)
+    chosen = dataset.identities(split) if split else everyone
+    return [dataset.vertex_count(identity) for identity in chosen or everyone]
 
 
 def span(numbers: Sequence[int]) -> str:

@@ -46,7 +46,7 @@ def _dataset_facts(dataset: Dataset) -> dict[str, str | int | float | Code]:
     poses = f"{recipe.poses.distribution.name} ({words})" if words else recipe.poses.distribution.name
     joints = len(dataset.attributes["joints"])
     seeds = f"identities {recipe.identities.seed}, poses {recipe.poses.seed}, triples {recipe.triples.seed}"
-    return {
+    facts: dict[str, str | int | float | Code] = {
         "name": name_of(dataset),
         "uuid": Code(dataset.uuid),
         "body": found["body"],
@@ -54,6 +54,7 @@ def _dataset_facts(dataset: Dataset) -> dict[str, str | int | float | Code]:
         "faces": span(faces),
         "identities": found["identities"],
         "poses": f"{len(dataset.grid.poses('seen')):,} seen, {len(dataset.grid.poses('unseen')):,} unseen",
+        "appended": found.get("appended", ""),
         "pose distribution": f"{poses}; {joints} joints" if joints else poses,
         "seeds": seeds,
         "evaluation triples": found["evaluation triples"],
@@ -66,6 +67,7 @@ def _dataset_facts(dataset: Dataset) -> dict[str, str | int | float | Code]:
         "sha256 of the recipe": Code(found["recipe sha256"]),
         "sha256 of the manifest": Code(dataset.attributes["manifest_sha256"]),
     }
+    return {name: fact for name, fact in facts.items() if fact != ""}
 
 
 def _assets(dataset: Dataset, sources: list[str]) -> Table:

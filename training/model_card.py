@@ -48,7 +48,7 @@ def model_card(run: Path, dataset: Dataset, rows: Sequence[Row] | None = None) -
     body: list[Block] = [Facts(_model_facts(checkpoint, recipe, dataset, home)), _changed(recipe)]
     body.append(Code(as_yaml({"training": recipe.model_dump(mode="json")}), folded="The whole training recipe"))
     body += _results(list(rows or ()))
-    limits = MODEL_LIMITS.format(vertices=span(vertex_counts(dataset)), network=_network_limits(recipe))
+    limits = MODEL_LIMITS.format(vertices=span(vertex_counts(dataset, "training")), network=_network_limits(recipe))
     licences = ", ".join(dict.fromkeys(plain(asset["licence"]) for asset in dataset.attributes["body"]["assets"]))
     body += [
         Text(f"### Intended use\n\n{MODEL_USE}\n\n### Limits\n\n{limits}{_worse_than_nothing(list(rows or ()))}"),
@@ -77,7 +77,7 @@ def _model_facts(
         "weights": f"{weights.relative_to(home).as_posix() if home in weights.parents else weights.name}"
         f", step {checkpoint.step:,}",
         "sha256 of the weights": Code(_sha256(weights)),
-        "trained on": f"{name_of(dataset)}",
+        "trained on": name_of(dataset) if checkpoint.dataset == dataset.uuid else "other data than this report's",
         "uuid of the data": Code(checkpoint.dataset or dataset.uuid),
         "steps": f"{checkpoint.step:,} of {recipe.batch} triples each",
         "time": f"{duration(float(clock.seconds[-1]))} of training" if len(clock) else "",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from datagen.errors import DsffnetError
 
-_ONE = r"[-+±~<>≤≥x]?\s?\d[\d,]*\.?\d*(?:e[-+]?\d+)?(?:\s?(?:%|°|[A-Za-zµ]{1,3}))?"
+_ONE = r"[-+±~<>≤≥x]?\s?(?:\d[\d,]*\.?\d*|\.\d+)(?:e[-+]?\d+)?(?:\s?(?:%|°|[A-Za-zµ]{1,3}))?"
 _NUMBER = re.compile(rf"{_ONE}(?:\s?(?:[/±]|to)\s?{_ONE})*(?:\s\({_ONE}(?:\s?to\s?{_ONE})?\))?")
 _MARKED = re.compile(r"(?P<stars>\*{1,3})(?P<text>[^*\s](?:[^*]*[^*\s])?)(?P=stars)")
 _NONE = {"", "-", "--", "–", "—", "nan", "n/a"}

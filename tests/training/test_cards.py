@@ -113,6 +113,12 @@ def test_weights_named_by_their_path_have_a_card_of_their_own(workflow: tuple[Pa
     assert facts["sha256 of the weights"] == hashlib.sha256(weights).hexdigest() and "time" not in facts
 
 
+def test_a_model_of_other_data_is_not_said_to_be_of_this(workflow: tuple[Path, list[Row]], tmp_path: Path) -> None:
+    other = generate(mixed_dataset(), str(tmp_path / "mixed.zarr"))
+    facts = facts_of(model_card(workflow[0] / "run", other))
+    assert "mixed" not in facts["trained on"] and facts["uuid of the data"] == opened(workflow[0]).uuid
+
+
 def test_changed_fields_stand_first_and_the_whole_recipe_can_be_read_back(workflow: tuple[Path, list[Row]]) -> None:
     card = model_card(workflow[0] / "run", opened(workflow[0]))
     changed = {line[0]: line[1:] for line in all_of(card, Table)[0].lines[1:]}

@@ -156,12 +156,12 @@ def test_columns_of_numbers_stand_at_the_right_and_marked_cells_are_bold(tmp_pat
 
 
 def test_intervals_and_differences_are_numbers_and_a_papers_own_stand_in_italics(tmp_path: Path) -> None:
-    lines = [["method", "PMD", "95 %"], ["ours", "1.20", "1.1 to 1.3"], ["*ours*", "*0.57*", "+3.4 (+1.2 to +5.6)"]]
+    lines = [["method", "PMD", "95 %"], ["ours", "1.20", "1.1 to 1.3"], ["*ours*", "*.57*", "+3.4 (+1.2 to +5.6)"]]
     table = Table(with_best(lines, columns=[1]))
-    assert table.numeric == [False, True, True] and table.lines[2][1] == "***0.57***"
+    assert table.numeric == [False, True, True] and table.lines[2][1] == "***.57***"
     reader, markdown = written(tmp_path, table)
-    assert "<strong><em>0.57</em></strong>" in (tmp_path / "report.html").read_text()
-    assert "***0.57***" in markdown and len(reader.all("em")) == 2
+    assert "<strong><em>.57</em></strong>" in (tmp_path / "report.html").read_text()
+    assert "***.57***" in markdown and len(reader.all("em")) == 2
     assert Table([["a"], ["*"], ["2 * 3"], ["** **"]]).numeric == [False]
 
 
