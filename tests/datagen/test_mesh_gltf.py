@@ -146,7 +146,7 @@ def test_skin_animation_and_morphs_are_applied_at_rest_then_dropped_and_named(tm
     document.json["animations"] = [{"samplers": [sampler], "channels": [channel]}]
     read = read_mesh_file(saved(document, tmp_path))
     rest = POINTS + 0.25
-    assert np.allclose(read.mesh.vertices, (rest + (0, 4, 0)) / 2 + 3 * rest / 2, atol=1e-6)
+    assert np.allclose(read.mesh.vertices, (rest + np.array([0, 4, 0])) / 2 + 3 * rest / 2, atol=1e-6)
     notes = write_posed(read, read.mesh.vertices, tmp_path / "out.glb")
     assert notes == ["skins", "animations", "morph targets"]
     again = read_mesh_file(tmp_path / "out.glb")
