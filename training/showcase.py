@@ -1,64 +1,129 @@
-"""What a person looks at after an evaluation: example figure, training curve, GLB files and the HTML viewer."""
+"""What a person looks at after an evaluation: figure of examples, training curve, GLB files and the HTML viewer."""
 
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import nn
 
+from datagen.grid import PoseType
 from datagen.mesh import Mesh, bounding_box, save_mesh
 from datagen.store import Dataset
 from training.batches import read_batch
+from training.comparison import Comparison
+from training.comparison_figure import comparison_figure
 from training.curves import training_curve
-from training.evaluation import POSE_TYPES, Row, evaluation_list
-from training.figures import TransferExample, transfer_figure
+from training.evaluation import NO_OPS, POSE_TYPES, Row, evaluation_list
 from training.inference import predict
 from training.journal import read_journal
 from training.recipe import EvaluationRecipe
 from training.viewer import write_viewer
 
 
-def examples_of(
-    dataset: Dataset, network: nn.Module, recipe: EvaluationRecipe, rows: list[Row]
-) -> list[TransferExample]:
-    """The first few triples of each evaluation list (not chosen by result), in metres, with their numbers."""
-    found = []
-    for pose_type in POSE_TYPES:
-        triples = evaluation_list(dataset, recipe, pose_type)[: recipe.examples]
-        if not len(triples):
-            continue
-        outputs = predict(network, read_batch(dataset, triples, padded=True)).double().numpy()
-        for place, (triple, output) in enumerate(zip(triples, outputs, strict=True)):
-            found.append(_example(dataset, pose_type, place, [int(number) for number in triple], output, rows))
-    return found
+def comparisons_of(
+    dataset: Dataset, networks: Mapping[str, nn.Module], recipe: EvaluationRecipe, rows: Sequence[Row]
+) -> list[Comparison]:
+    """The first few triples of each evaluation list (not chosen by result) by each network, in metres.
+
+    Parameters
+    ----------
+    dataset
+        Of which the fixed lists of evaluation triples are used.
+    networks
+        Name of each method -> its network.
+    recipe
+        ``examples`` says how many triples of each pose type.
+    rows
+        The numbers under the pictures; a method without a row for a triple has none.
+    """
+    numbers = {(row.method, row.pose_type, row.triple): row for row in rows}
+    return [one for pose_type in POSE_TYPES for one in _compared(dataset, networks, recipe, pose_type, numbers)]
 
 
-def _example(
-    dataset: Dataset, pose_type: str, place: int, triple: list[int], output: np.ndarray, rows: list[Row]
-) -> TransferExample:
-    source_identity, source_pose, target_identity, target_pose = triple
-    faces = dataset.faces(target_identity)
-    truth = dataset.vertices(target_identity, source_pose).astype(np.float64)
-    row = next(r for r in rows if (r.pose_type, r.triple) == (pose_type, place) and not r.method.endswith("unchanged"))
-    return TransferExample(
-        title=f"{pose_type} pose {source_pose}, from identity {source_identity} to new identity {target_identity}",
-        source=Mesh(dataset.vertices(source_identity, source_pose), dataset.faces(source_identity)),
-        target=Mesh(dataset.vertices(target_identity, target_pose), faces),
-        output=Mesh(bounding_box(truth).restore(output[: len(truth)]), faces),
-        truth=Mesh(truth, faces),
-        metrics=f"PMD {row.pmd * 1e4:.1f}e-4, mean error {row.millimetres:.0f} mm",
-    )
+def examples_of(dataset: Dataset, network: nn.Module, recipe: EvaluationRecipe, rows: list[Row]) -> list[Comparison]:
+    """:func:`comparisons_of` one network, called as its rows call it."""
+    return comparisons_of(dataset, {_method_of(rows): network}, recipe, rows)
 
 
-def draw_examples(examples: list[TransferExample], folder: Path, *, title: str) -> None:
-    """Write figures/examples.png, viewer.html, and meshes/NN-ROLE.glb for each example."""
-    transfer_figure(examples, folder / "figures" / "examples.png")
-    write_viewer(examples, folder / "viewer.html", title=title)
-    for number, example in enumerate(examples):
-        for role in ("source", "target", "output", "truth"):
-            mesh = getattr(example, role)
+def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: str) -> None:
+    """Write figures/examples.png, viewer.html, and meshes/NN-ROLE.glb of each; an output is NN-output-METHOD.glb.
+
+    Of a single method it is NN-output.glb.
+    """
+    comparison_figure(comparisons, folder / "figures" / "examples.png")
+    write_viewer(comparisons, folder / "viewer.html", title=title)
+    for number, comparison in enumerate(comparisons):
+        for name, mesh in comparison.meshes().items():
+            role = "output" if name.startswith("output ") and len(comparison.outputs) == 1 else _file_name(name)
             save_mesh(Mesh(mesh.vertices, mesh.faces), folder / "meshes" / f"{number:02d}-{role}.glb")
+
+
+def draw_examples(examples: Sequence[Comparison], folder: Path, *, title: str) -> None:
+    """:func:`draw_comparisons`."""
+    draw_comparisons(examples, folder, title=title)
 
 
 def draw_training_curve(run: Path, path: Path, *, baselines: dict[str, float]) -> None:
     """Loss and evaluation PMD over the steps of a run; ``baselines`` are dashed lines."""
     training_curve(read_journal(run / "metrics.jsonl"), path, baselines=baselines)
+
+
+_Numbers = Mapping[tuple[str, str, int], Row]
+
+
+def _compared(
+    dataset: Dataset,
+    networks: Mapping[str, nn.Module],
+    recipe: EvaluationRecipe,
+    pose_type: PoseType,
+    numbers: _Numbers,
+) -> list[Comparison]:
+    triples = evaluation_list(dataset, recipe, pose_type)[: recipe.examples]
+    if not len(triples):
+        return []
+    batch = read_batch(dataset, triples, padded=True)
+    outputs = {name: predict(network, batch).double().cpu().numpy() for name, network in networks.items()}
+    found = []
+    for place, triple in enumerate(triples.tolist()):
+        words = {
+            name: _words(numbers[name, pose_type, place]) for name in networks if (name, pose_type, place) in numbers
+        }
+        shown = {name: output[place] for name, output in outputs.items()}
+        found.append(_comparison(dataset, pose_type, triple, shown, words))
+    return found
+
+
+def _comparison(
+    dataset: Dataset,
+    pose_type: PoseType,
+    triple: list[int],
+    outputs: Mapping[str, NDArray[np.float64]],
+    metrics: Mapping[str, str],
+) -> Comparison:
+    source_identity, source_pose, target_identity, target_pose = triple
+    faces = dataset.faces(target_identity)
+    truth = dataset.vertices(target_identity, source_pose).astype(np.float64)
+    box = bounding_box(truth)
+    return Comparison(
+        title=f"{pose_type} pose {source_pose}, from identity {source_identity} to new identity {target_identity}",
+        source=Mesh(dataset.vertices(source_identity, source_pose), dataset.faces(source_identity)),
+        target=Mesh(dataset.vertices(target_identity, target_pose), faces),
+        outputs={name: Mesh(box.restore(output[: len(truth)]), faces) for name, output in outputs.items()},
+        truth=Mesh(truth, faces),
+        metrics=metrics,
+    )
+
+
+def _words(row: Row) -> str:
+    return f"PMD {row.pmd * 1e4:.1f}e-4, {row.millimetres:.0f} mm"
+
+
+def _method_of(rows: Sequence[Row]) -> str:
+    return next((row.method for row in rows if row.method not in NO_OPS), "output")
+
+
+def _file_name(name: str) -> str:
+    """A name for a file: what not every file system takes becomes a hyphen."""
+    return re.sub(r"[^A-Za-z0-9._]+", "-", name).strip("-.")

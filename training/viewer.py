@@ -1,9 +1,9 @@
-"""An interactive page of transfer examples: one HTML file that needs neither network nor server.
+"""An interactive page of transfers, by one method or several: one HTML file that needs neither network nor server.
 
 What is embedded, little-endian in base64: positions as uint16 between the corners of each mesh's box (off by at most
 half a step, ``box / 65535 / 2``: 15 micrometres for a body of 2 m), triangles as uint16 or uint32 and once for all
-meshes that share them, errors as float32 in the unit of the colour bar. The drawing code is assets/viewer.js, bundled
-with three.js.
+meshes that share them, errors as uint16 levels of the largest. The drawing code is assets/viewer.js, bundled with
+three.js.
 """
 
 import base64
@@ -22,36 +22,33 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.mesh import write_atomically
-from training.figures import (
-    ERROR_COLORS,
-    ROLE_COLORS,
-    ErrorScale,
-    TransferExample,
-    placed,
-    vertex_errors,
-)
+from training.camera import frame
+from training.comparison import Comparison, ErrorScale, Solid, best_of, methods_in, output_of, placed, to_frame
+from training.lighting import ground_shadow, openness
+from training.palette import ERROR_COLORS, ROLE_COLORS, method_colors
 from training.rasteriser import Floats, Integers
-from training.rendering import frame, ground_shadow, openness
 
 _LEVELS = 65535
 _GROUND_EVERY = 2  # the page keeps every second cell of the ground's shadow
 
 
 def write_viewer(
-    examples: Sequence[TransferExample],
+    examples: Sequence[Comparison],
     path: str | os.PathLike[str],
     *,
     title: str,
     error_scale: ErrorScale | None = None,
 ) -> Path:
-    """Write a page with source, target, output, ground truth and error of every example, to be turned with the mouse.
+    """Write a page with source, target, outputs, ground truth and errors of every example, to be turned with the mouse.
 
-    It works from a file, from a server, and inside a frame; it loads nothing. Names and titles are shown as plain text.
+    All panels of the page turn together. Of several methods each can be hidden. Without a truth there are no errors.
+    The page works from a file, from a server, and inside a frame; it loads nothing. Names and titles are shown as
+    plain text.
 
     Parameters
     ----------
-    examples : sequence of TransferExample
-        A mesh's ``name`` attribute, where it has one, is shown under its panel.
+    examples : sequence of Comparison
+        A mesh's ``name`` attribute, where it has one, is shown under its panel; under an output, its metrics.
     path : path of the HTML to write
     title : str
         Heading of the page.
@@ -66,7 +63,7 @@ def write_viewer(
     Raises
     ------
     ValueError
-        If there is no example, or an output and its truth differ in shape.
+        If there is no example, a vertex is not finite, or an output and its truth differ in shape.
     """
     if not examples:
         raise ValueError("write_viewer needs at least one example")
@@ -82,11 +79,13 @@ def write_viewer(
     return Path(path)
 
 
-def viewer_payload(examples: Sequence[TransferExample], *, error_scale: ErrorScale) -> dict[str, Any]:
-    """Return what the page is given: meshes standing on the ground, errors, colours and the first view."""
+def viewer_payload(examples: Sequence[Comparison], *, error_scale: ErrorScale) -> dict[str, Any]:
+    """Return what the page is given: meshes standing on the ground, errors, colours and the first views."""
     triangles: dict[str, dict[str, str]] = {}
+    methods = methods_in(examples)
     return {
         "examples": [_example(example, error_scale, triangles) for example in examples],
+        "methods": [{"name": name, "color": color} for name, color in method_colors(methods).items()],
         "faces": triangles,
         "colors": dict(ROLE_COLORS),
         "error": {
@@ -94,7 +93,6 @@ def viewer_payload(examples: Sequence[TransferExample], *, error_scale: ErrorSca
             "limit": error_scale.resolved(examples),
             "colors": np.rint(255 * ERROR_COLORS).astype(int).tolist(),
         },
-        "view": _view(examples),
     }
 
 
@@ -104,26 +102,44 @@ def decode_positions(mesh: dict[str, Any]) -> Floats:
     return np.asarray(np.array(mesh["low"]) + levels * np.array(mesh["step"]))
 
 
-def _example(example: TransferExample, scale: ErrorScale, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
-    errors = scale.factor * vertex_errors(example)
+def _example(comparison: Comparison, scale: ErrorScale, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+    meshes, errors = placed(comparison), scale.of(comparison)
+    originals = comparison.meshes()
+    embedded = {
+        name: _mesh(mesh, str(getattr(originals[name], "name", "")), triangles) for name, mesh in meshes.items()
+    }
     return {
-        "title": example.title,
-        "metrics": example.metrics,
-        "meshes": {
-            role: _mesh(vertices, getattr(example, role), triangles) for role, vertices in placed(example).items()
-        },
-        "errors": _base64(errors.astype("<f4")),
-        "error_text": f"mean {errors.mean():.3g}, largest {errors.max():.3g} {scale.unit}",
+        "title": comparison.title,
+        "source": embedded["source"],
+        "target": embedded["target"],
+        "truth": embedded.get("truth"),
+        "outputs": {name: embedded[output_of(name)] for name in comparison.outputs},
+        "metrics": {name: comparison.metrics.get(name, "") for name in comparison.outputs},
+        "errors": {name: _errors(values, scale.unit) for name, values in errors.items()},
+        "best": best_of(errors),
+        "view": _view(meshes),
     }
 
 
-def _mesh(vertices: Floats, original: Any, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+def _errors(errors: Floats, unit: str) -> dict[str, Any]:
+    """Return a method's errors [v], and their mean and maximum in words."""
+    largest = float(errors.max())
+    step = max(largest, 1e-12) / _LEVELS
+    return {
+        "levels": _base64(np.rint(errors / step).astype("<u2")),
+        "step": step,
+        "mean": float(errors.mean()),
+        "text": f"mean {errors.mean():.3g}, max {largest:.3g} {unit}",
+    }
+
+
+def _mesh(mesh: Solid, name: str, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+    vertices, faces = mesh.vertices, np.asarray(mesh.faces, np.int64)
     low = vertices.min(0)
     step = np.maximum(np.ptp(vertices, axis=0), 1e-12) / _LEVELS
-    faces = np.asarray(original.faces, np.int64)
     shadow, corner, side = ground_shadow(vertices, faces)
     return {
-        "name": str(getattr(original, "name", "")),
+        "name": name,
         "positions": _base64(np.rint((vertices - low) / step).astype("<u2")),
         "low": low.tolist(),
         "step": step.tolist(),
@@ -146,11 +162,11 @@ def _shared_faces(faces: Integers, vertex_count: int, triangles: dict[str, dict[
     return key
 
 
-def _view(examples: Sequence[TransferExample]) -> dict[str, Any]:
-    """Return the first view, one scale for all examples: the direction of the pictures, and the extent to hold."""
-    points = np.concatenate([vertices for example in examples for vertices in placed(example).values()])
-    axes = frame([_Points(points)]).axes()
-    in_view = points @ axes.T
+def _view(meshes: dict[str, Solid]) -> dict[str, Any]:
+    """Return an example's first view, that of the pictures: its direction, and the extent to hold."""
+    framed = to_frame(meshes)
+    axes = frame(framed).axes()
+    in_view = np.concatenate([mesh.vertices for mesh in framed]) @ axes.T
     extent = np.ptp(in_view, axis=0)
     return {
         "direction": axes[2].tolist(),
@@ -159,12 +175,6 @@ def _view(examples: Sequence[TransferExample]) -> dict[str, Any]:
         "height": float(extent[1]),
         "depth": float(extent[2]),
     }
-
-
-class _Points:
-    def __init__(self, vertices: Floats) -> None:
-        self.vertices: Floats = vertices
-        self.faces: Integers = np.zeros((0, 3), np.int64)
 
 
 def _base64(array: npt.NDArray[Any]) -> str:

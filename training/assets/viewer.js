@@ -11,6 +11,8 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
 const faceCache = new Map();
+const errors = data.examples.some((example) => Object.keys(example.errors).length);
+const stacked = errors && data.methods.length > 1; // an error below each output
 let renderer;
 let panels = [];
 let current = 0;
@@ -102,37 +104,89 @@ function clear(scene) {
   }
 }
 
+// What a panel shows of an example: mesh, colours, words below; nothing where a method or the truth is missing.
+function content(panel, example) {
+  if (panel.kind === "error") {
+    const error = example.errors[panel.method];
+    const mesh = example.outputs[panel.method];
+    return error && { mesh, words: error.text, strength: 0.35, colors: errorColors(errorValues(error)) };
+  }
+  const mesh = panel.kind === "output" ? example.outputs[panel.method] : example[panel.kind];
+  const words = panel.kind === "output" && data.methods.length > 1 ? example.metrics[panel.method] : mesh?.name;
+  return mesh && { mesh, words, strength: 0.8, colors: roleColors(data.colors[panel.kind], bytes(mesh.openness).length) };
+}
+
+function errorValues(error) {
+  return Float32Array.from(decode(error.levels, "uint16"), (level) => level * error.step);
+}
+
+function refill(panel, example) {
+  const shown = content(panel, example);
+  clear(panel.scene);
+  if (shown) panel.scene.add(surface(shown.mesh, shaded(shown.colors, decode(shown.mesh.openness, "uint8"), shown.strength)), ground(shown.mesh));
+  panel.element.querySelector(".name").textContent = shown ? shown.words : "none";
+  panel.element.classList.toggle("best", panel.kind === "output" && panel.method === example.best);
+}
+
 function show(index) {
+  const before = data.examples[current].view;
   current = (index + data.examples.length) % data.examples.length;
   const example = data.examples[current];
-  for (const panel of panels) {
-    const mesh = example.meshes[panel.role === "error" ? "output" : panel.role];
-    const openness = decode(mesh.openness, "uint8");
-    const heat = panel.role === "error";
-    const colors = heat ? errorColors(decode(example.errors, "float32")) : roleColors(data.colors[panel.role], openness.length);
-    clear(panel.scene);
-    panel.scene.add(surface(mesh, shaded(colors, openness, heat ? 0.35 : 0.8)), ground(mesh));
-    panel.element.querySelector(".name").textContent = heat ? example.error_text : mesh.name;
-  }
+  const { leader } = panels;
+  panels.leader = null; // each panel moves by itself here
+  for (const panel of panels) refill(panel, example);
+  if (touched) panels.forEach((panel) => carry(panel, before, example.view));
+  else panels.forEach(home);
+  panels.leader = leader;
+  rank(example);
   find("caption").textContent = example.title;
-  find("metrics").textContent = example.metrics;
+  find("metrics").textContent = data.methods.length === 1 ? example.metrics[data.methods[0].name] ?? "" : "";
   find("choice").value = find("slider").value = String(current);
   find("count").textContent = `${current + 1} / ${data.examples.length}`;
   redraw();
 }
 
+// Mean errors of an example as bars, shortest best; all examples share one scale.
+function rank(example) {
+  const all = data.examples.flatMap((one) => Object.values(one.errors).map((error) => error.mean));
+  find("ranking").replaceChildren(...data.methods.filter(({ name }) => example.errors[name]).map(({ name, color }) => {
+    const { mean } = example.errors[name];
+    const row = make("li", name === example.best ? "best" : "");
+    const bar = make("i", "bar");
+    bar.style.background = color;
+    bar.style.width = `${Math.max((100 * mean) / Math.max(...all), 0.5)}%`;
+    row.append(make("span", "label", name), make("span", "value", `${Number(mean.toPrecision(3))} ${data.error.unit}`), bar);
+    return row;
+  }));
+}
+
 function home(panel) {
   const { camera, controls } = panel;
-  const direction = new Vector3(...data.view.direction);
-  const slope = Math.tan((camera.fov * Math.PI) / 360) * 0.88;
-  const distance = Math.max(data.view.height / slope, data.view.width / (slope * camera.aspect)) / 2 + data.view.depth / 2;
-  controls.target.set(...data.view.center);
-  camera.position.copy(controls.target).addScaledVector(direction, distance);
+  const { view } = data.examples[current];
+  const slope = Math.tan((camera.fov * Math.PI) / 360) * 0.82;
+  const distance = Math.max(view.height / slope, view.width / (slope * camera.aspect)) / 2 + view.depth / 2;
+  controls.target.set(...view.center);
+  camera.position.copy(controls.target).addScaledVector(new Vector3(...view.direction), distance);
+  limits(panel, distance);
+  controls.update();
+}
+
+function limits({ camera, controls }, distance) {
   camera.near = distance / 100;
   camera.far = distance * 20;
   controls.minDistance = distance / 20;
   controls.maxDistance = distance * 6;
   camera.updateProjectionMatrix();
+}
+
+// Where the reader has turned the view, another example is seen from there too, in its own size.
+function carry(panel, before, after) {
+  const { camera, controls } = panel;
+  const ratio = Math.max(after.width, after.height) / Math.max(before.width, before.height, 1e-12);
+  const offset = camera.position.clone().sub(controls.target).multiplyScalar(ratio);
+  controls.target.sub(new Vector3(...before.center)).multiplyScalar(ratio).add(new Vector3(...after.center));
+  limits(panel, (controls.minDistance * 20) * ratio);
+  camera.position.copy(controls.target).add(offset);
   controls.update();
 }
 
@@ -145,8 +199,81 @@ function follow(leader) {
   }
 }
 
-function addPanel(element) {
-  const panel = { element, role: element.dataset.role, scene: new Scene(), camera: new PerspectiveCamera(18, 1, 0.1, 100) };
+function make(tag, name, words = "") {
+  const element = document.createElement(tag);
+  element.className = name;
+  element.textContent = words;
+  return element;
+}
+
+// Tiles from left to right, each with its panels from top to bottom.
+function tiles() {
+  const one = (kind, method = "") => ({ kind, method });
+  const outputs = data.methods.map(({ name }) => (stacked ? [one("output", name), one("error", name)] : [one("output", name)]));
+  const truth = data.examples.some((example) => example.truth) ? [[one("truth")]] : [];
+  if (stacked) return [[one("source"), one("target")], ...outputs, ...truth];
+  return [[one("source")], [one("target")], ...outputs, ...truth, ...(errors ? [[one("error", data.methods[0].name)]] : [])];
+}
+
+const WORDS = { source: ["Source", "pose"], target: ["Target", "identity"], truth: ["Ground truth", ""], error: ["Error", ""] };
+
+function heading({ kind, method }) {
+  const [words, small] = WORDS[kind] ?? [data.methods.length > 1 ? method : "Output", ""];
+  const title = make("h2", "", words);
+  const dot = make("i", "dot");
+  dot.style.background = data.methods.find(({ name }) => name === method)?.color;
+  if (kind === "output" && data.methods.length > 1) title.prepend(dot);
+  title.append(make("small", "", small), make("small", "tag", "least error"));
+  return title;
+}
+
+function build() {
+  for (const specs of tiles()) {
+    const tile = make("div", "tile");
+    for (const spec of specs) {
+      const element = make("section", "panel");
+      element.append(heading(spec), make("p", "name"));
+      tile.append(element);
+      panels.push({ ...spec, element, tile });
+    }
+    if (stacked && specs[0].kind === "truth") tile.append(find("numbers"));
+    find("grid").append(tile);
+  }
+  find("numbers").hidden = !errors;
+  for (const { name, color } of data.methods.length > 1 ? data.methods : []) find("methods").append(chip(name, color));
+}
+
+function chip(name, color) {
+  const label = make("label", "chip");
+  const box = document.createElement("input");
+  Object.assign(box, { type: "checkbox", checked: true });
+  box.style.accentColor = color;
+  box.addEventListener("change", () => {
+    for (const panel of panels.filter(({ method }) => method === name)) panel.tile.hidden = !box.checked;
+    resize();
+  });
+  label.append(box, name);
+  return label;
+}
+
+// As many tiles abreast as have room, lines of equal length, and panels as high as the window allows.
+function fit() {
+  const grid = find("grid");
+  const shown = [...grid.querySelectorAll(".tile:not([hidden])")].length;
+  const gap = 8;
+  const abreast = Math.max(Math.floor((grid.clientWidth + gap) / (168 + gap)), 1);
+  const lines = Math.ceil(shown / abreast);
+  const columns = Math.ceil(shown / lines);
+  const width = (grid.clientWidth - gap * (columns - 1)) / columns;
+  const room = window.innerHeight - grid.getBoundingClientRect().top - window.scrollY - document.querySelector("footer").offsetHeight;
+  const height = lines === 1 ? Math.min(stacked ? (room - gap) / 2 : room, 1.6 * width) : 1.1 * width;
+  grid.style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
+  grid.style.setProperty("--panel-height", `${Math.round(Math.max(height, 200))}px`);
+}
+
+function addPanel(panel) {
+  const { element } = panel;
+  Object.assign(panel, { scene: new Scene(), camera: new PerspectiveCamera(18, 1, 0.1, 100) });
   panel.controls = new OrbitControls(panel.camera, element);
   panel.controls.addEventListener("start", () => { touched = true; panels.leader = panel; });
   panel.controls.addEventListener("change", () => {
@@ -159,7 +286,6 @@ function addPanel(element) {
   fill.position.set(0.85, 0.05, 0.5);
   panel.camera.add(key, fill); // the light stays at the viewer's shoulder
   panel.scene.add(panel.camera, new HemisphereLight(0xffffff, 0xa9a6a2, 1.25));
-  return panel;
 }
 
 function redraw() {
@@ -178,6 +304,7 @@ function draw() {
   renderer.setScissorTest(true);
   for (const panel of panels) {
     const box = panel.element.getBoundingClientRect();
+    if (!box.width) continue; // hidden
     const rectangle = [box.left - page.left, page.bottom - box.bottom, box.width, box.height];
     renderer.setViewport(...rectangle);
     renderer.setScissor(...rectangle);
@@ -187,10 +314,11 @@ function draw() {
 
 function resize() {
   if (!renderer) return;
+  fit();
   const grid = find("grid");
   renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
   renderer.setSize(grid.clientWidth, grid.clientHeight, false);
-  for (const panel of panels) {
+  for (const panel of panels.filter(({ element }) => element.clientWidth)) {
     panel.camera.aspect = panel.element.clientWidth / Math.max(panel.element.clientHeight, 1);
     panel.camera.updateProjectionMatrix();
     if (!touched) home(panel);
@@ -216,7 +344,7 @@ function listen() {
     redraw();
   });
   find("wireframe").addEventListener("change", (event) => {
-    panels.forEach((panel) => { panel.scene.getObjectByName("wireframe").visible = event.target.checked; });
+    panels.forEach((panel) => { const wire = panel.scene.getObjectByName("wireframe"); if (wire) wire.visible = event.target.checked; });
     redraw();
   });
   document.addEventListener("keydown", (event) => {
@@ -225,6 +353,7 @@ function listen() {
     else if (event.key === "ArrowRight") show(current + 1);
   });
   new ResizeObserver(resize).observe(find("grid"));
+  window.addEventListener("resize", resize);
 }
 
 function fill() {
@@ -244,15 +373,17 @@ function fill() {
 
 function start() {
   fill();
+  build();
   try {
     renderer = new WebGLRenderer({ antialias: true, alpha: true });
     renderer.autoClear = false;
     renderer.domElement.setAttribute("aria-hidden", "true");
     renderer.domElement.addEventListener("webglcontextrestored", redraw);
     find("grid").append(renderer.domElement);
-    panels = [...document.querySelectorAll(".panel")].map(addPanel);
+    panels.forEach(addPanel);
   } catch (reason) { // titles and numbers can still be read
     console.warn(reason);
+    panels = [];
     document.querySelectorAll(".drawn").forEach((element) => { element.hidden = true; });
     find("message").hidden = false;
   }
