@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import MeshError
+from datagen.errors import RecipeError
 from datagen.mesh import bounding_box
 
 Floats = NDArray[np.floating]
@@ -31,7 +31,7 @@ class Axes:
 
     Raises
     ------
-    MeshError
+    RecipeError
         A name is none of X, Y, Z, -X, -Y, -Z, or both lie along one line.
     """
 
@@ -41,9 +41,9 @@ class Axes:
     def __post_init__(self) -> None:
         for name in (self.up, self.front):
             if name not in NAMES:
-                raise MeshError(f"{name!r} is no axis; name one of {', '.join(NAMES)}")
+                raise RecipeError(f"{name!r} is no axis; name one of {', '.join(NAMES)}")
         if self.up[-1] == self.front[-1]:
-            raise MeshError(f"a body cannot have {self.up} up and face {self.front}: name two different axes")
+            raise RecipeError(f"a body cannot have {self.up} up and face {self.front}: name two different axes")
 
     def __str__(self) -> str:
         return f"{self.up} up, facing {self.front}"
@@ -80,12 +80,12 @@ def axes_of_both(up: str, front: str) -> tuple[Axes, Axes]:
 
     Raises
     ------
-    MeshError
+    RecipeError
         A name is no axis, or there are more than two.
     """
     ups, fronts = (names.upper().split(",") for names in (up, front))
     if max(len(ups), len(fronts)) > 2:
-        raise MeshError(f"--up={up} --front={front}: name one axis, or two with a comma, of the source and the target")
+        raise RecipeError(f"--up={up} --front={front}: name one axis, or two with a comma, of source and target")
     return Axes(ups[0], fronts[0]), Axes(ups[-1], fronts[-1])
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs
 
 Floats = NDArray[np.floating]
 _DEGREE = 2
@@ -51,5 +50,7 @@ def _fitted(frames: Sequence[Floats], place: int) -> Floats:
     """The frame at ``place`` on the parabolas through all ``frames``."""
     if len(frames) <= _DEGREE + 1:
         return frames[place]
+    from scipy.signal import savgol_coeffs  # a quarter of a second, which a single mesh need not wait for
+
     weights = savgol_coeffs(len(frames), _DEGREE, pos=place, use="dot")
     return np.asarray(sum(weight * frame for weight, frame in zip(weights, frames, strict=True)))

@@ -152,8 +152,8 @@ def _about_count(name: str, count: int, seen: Seen | None) -> Iterator[str]:
     if count > most * _TIMES_AS_MANY or count < fewest / _TIMES_AS_MANY:
         known = f"{fewest:,}" if fewest == most else f"{fewest:,} to {most:,}"
         yield (
-            f"{name} has {count:,} vertices, training saw {known}: fine detail moves less surely; --refine helps, "
-            "and so does training on a denser topology"
+            f"{name} has {count:,} vertices, training saw {known}: its surface may come out dented; add --refine, "
+            "or train on bodies of about as many"
         )
 
 

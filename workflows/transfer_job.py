@@ -7,6 +7,7 @@ from pathlib import Path
 
 from datagen.errors import MeshError, RecipeError
 from datagen.mesh_files import check_writable, frames_of
+from training.alignment import UPRIGHT, Axes, axes_of_both
 
 _ANIMATED = ".glb"
 
@@ -15,19 +16,19 @@ _ANIMATED = ".glb"
 class TransferJob:
     """One transfer, or one for each frame of a sequence.
 
-    ``window``: frames of the smoothing; what follows is as on the command line.
+    ``axes``: how source and target stand, None to find it; ``is_told``: a person has said so; ``window``: frames of
+    the smoothing; what follows is as on the command line.
     """
 
     sources: list[Path]
     target: Path
     out: Path
     is_sequence: bool
+    axes: tuple[Axes, Axes] | None = (UPRIGHT, UPRIGHT)
+    is_told: bool = False
     window: int = 0
     fps: float = 30.0
     refine: bool = False
-    align: bool = False
-    up: str | None = None
-    front: str | None = None
     picture: bool = False
     viewer: bool = False
 
@@ -45,12 +46,15 @@ class TransferJob:
         source, target = _two_meshes(options)
         if options.align and (options.up or options.front):
             raise RecipeError("--align finds how the meshes stand; leave it out to say it by --up and --front")
+        of_source, of_target = axes_of_both(options.up or UPRIGHT.up, options.front or UPRIGHT.front)
         is_sequence = source.is_dir() or any(sign in source.name for sign in "*?%#")
         return cls(
             sources=frames_of(source) if is_sequence else [source],
             target=target,
             out=Path(options.out),
             is_sequence=is_sequence,
+            axes=None if options.align else (of_source, of_target),
+            is_told=bool(options.up or options.front),
             window=_frames_of_window(options.smooth, options.fps),
             **{name: getattr(options, name) for name in _SAME},
         )
@@ -94,7 +98,7 @@ class TransferJob:
             check_writable(path)
 
 
-_SAME = ("fps", "refine", "align", "up", "front", "picture", "viewer")
+_SAME = ("fps", "refine", "picture", "viewer")
 
 
 def _two_meshes(options: argparse.Namespace) -> tuple[Path, Path]:

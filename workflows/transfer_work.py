@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,15 @@ from numpy.typing import NDArray
 from datagen.errors import StorageError
 from datagen.mesh import Mesh
 from datagen.mesh_files import MeshFile, read_mesh_file, write_animation, write_posed
-from training.alignment import UPRIGHT, Axes, axes_of_both, orientation
+from training.alignment import UPRIGHT, Axes, orientation
 from training.refinement import DEFAULT_WEIGHT
 from training.transfer import PoseTransfer
-from training.transfer_pictures import Shown, write_picture
 from training.unlikeness import remarks, seen_by
 from workflows.progress import bar
 from workflows.transfer_job import TransferJob
+
+if TYPE_CHECKING:
+    from training.transfer_pictures import NamedMesh
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
 _VOTING_FRAMES = 3  # of a sequence, on how it stands
@@ -36,16 +39,15 @@ class TransferWork:
     def __init__(self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile) -> None:
         """``first`` is the source, or the first frame of a sequence."""
         self.job, self.transfer, self.first, self.target = job, transfer, first, target
-        self.axes = axes_of_both(job.up or UPRIGHT.up, job.front or UPRIGHT.front)
+        self.axes = job.axes or (UPRIGHT, UPRIGHT)
         self._shown: dict[int, Mesh] = {}
 
     def settle_axes(self, weights: Path) -> None:
         """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
         errors = self.transfer.self_errors
         ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
-        if self.job.align:
-            self.axes = ways[0].axes, ways[1].axes
-        chosen, seen = bool(self.job.align or self.job.up or self.job.front), seen_by(weights)
+        self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
+        chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
         meshes = {str(self.job.sources[0]): self.first, str(self.job.target): self.target.mesh}
         for (name, mesh), axes, way in zip(meshes.items(), self.axes, ways, strict=True):
             for line in remarks(mesh, name=name, axes=axes, way=way, chosen=chosen, seen=seen):
@@ -54,8 +56,8 @@ class TransferWork:
     def run(self) -> str:
         """Write everything; what was done, in a line."""
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
-        if self.job.picture:
-            self._draw(self.job.beside(".png"))
+        if self.job.picture or self.job.viewer:
+            self._draw()
         return done
 
     def _votes(self) -> list[NDArray[np.floating]]:
@@ -109,28 +111,34 @@ class TransferWork:
             source_axes=self.axes[0],
             target_axes=self.axes[1],
         )
-        shown = bar(frames, total=count, what="transfer", unit="frame") if self.job.is_sequence else frames
-        for number, posed in enumerate(shown):
+        passing = bar(frames, total=count, what="transfer", unit="frame") if self.job.is_sequence else frames
+        for number, posed in enumerate(passing):
             if number in kept:
                 self._shown[number] = posed
             yield posed
 
-    def _draw(self, path: Path) -> None:
-        job, target = self.job, _upright(self.target.mesh, self.axes[1])
+    def _draw(self) -> None:
+        from training.transfer_pictures import shown, write_page, write_picture
+
+        job = self.job
         rows = [
-            Shown(
-                _upright(self._source(number), self.axes[0]),
-                target,
-                _upright(posed, self.axes[1]),
-                name=job.sources[number].name if job.is_sequence else "",
+            shown(
+                _upright(self._source(number), self.axes[0], job.sources[number]),
+                _upright(self.target.mesh, self.axes[1], job.target),
+                _upright(posed, self.axes[1], job.frame_file(job.sources[number]) if job.is_sequence else job.out),
             )
             for number, posed in self._shown.items()
         ]
-        write_picture(rows, {"source": job.sources[0].name, "target": job.target.name, "output": job.out.name}, path)
+        if job.picture:
+            write_picture(rows, job.beside(".png"))
+        if job.viewer:
+            write_page(rows, job.beside(".html"))
 
 
-def _upright(mesh: Mesh, axes: Axes) -> Mesh:
-    return Mesh(axes.turned(mesh.vertices), mesh.faces)
+def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
+    from training.transfer_pictures import NamedMesh  # it brings matplotlib, which a transfer does not need otherwise
+
+    return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
 
 
 @contextmanager

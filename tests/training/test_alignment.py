@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datagen.errors import MeshError
+from datagen.errors import RecipeError
 from training.alignment import EVERY_AXES, UPRIGHT, Axes, axes_of_both, orientation
 
 BODY = np.random.default_rng(0).normal(size=(60, 3)) * (1, 3, 0.5) + (0, 0, 0.2)
@@ -70,5 +70,5 @@ def test_axes_of_one_or_both_meshes_by_hand() -> None:
     [("W", "Z", "'W' is no axis"), ("Y", "-Y", "two different axes"), ("Y,Z,X", "Z", "one axis, or two")],
 )
 def test_axes_that_mean_nothing(up: str, front: str, says: str) -> None:
-    with pytest.raises(MeshError, match=says):
+    with pytest.raises(RecipeError, match=says):
         axes_of_both(up, front)
