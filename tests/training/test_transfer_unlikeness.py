@@ -21,7 +21,14 @@ GOOD = Orientation(np.full(24, 0.05) - 0.049 * (np.arange(24) == 0))
 SEEN = Seen((200, 300), np.array([0.4, 0.9, 0.1]), np.array([0.8, 1.0, 0.3]))
 
 
-def told(mesh: Mesh, *, way: Orientation = GOOD, axes: Axes = UPRIGHT, chosen: bool = False, seen: Seen | None = SEEN) -> str:  # fmt: skip
+def told(
+    mesh: Mesh,
+    *,
+    way: Orientation = GOOD,
+    axes: Axes = UPRIGHT,
+    chosen: bool = False,
+    seen: Seen | None = SEEN,
+) -> str:
     return "\n".join(remarks(mesh, name="A", axes=axes, way=way, chosen=chosen, seen=seen))
 
 
