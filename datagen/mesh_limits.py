@@ -1,0 +1,80 @@
+"""Mesh files that are too large, refused before they are read whole."""
+
+import json
+import struct
+from pathlib import Path
+from typing import IO
+
+from datagen.errors import MeshError
+from datagen.mesh_plain import is_binary_stl
+from datagen.mesh_ply_layout import read_header
+
+VERTEX_LIMIT = 2_000_000
+"""Vertices of a mesh at most. At the limit reading takes some 3 GB of memory and the network far more; scans have more
+vertices, bodies for animation a thousandth of it."""
+BYTE_LIMIT = 2**30
+_BLOCK = 2**22
+_JSON_LIMIT = 2**28
+
+
+def refuse_huge(path: Path) -> None:
+    """Refuse a mesh file with too many vertices, by its header or by counting; at most 4 MB of it are in memory.
+
+    Raises
+    ------
+    MeshError
+        More than ``VERTEX_LIMIT`` vertices, or more than ``BYTE_LIMIT`` bytes.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        found = _COUNTS[path.suffix.lower()](file, size)
+    advice = "decimate it (for example in Blender or MeshLab) and try again"
+    if found > VERTEX_LIMIT:
+        raise MeshError(f"{path} has more than {VERTEX_LIMIT:,} vertices ({found:,} counted): {advice}")
+    if size > BYTE_LIMIT:
+        raise MeshError(f"{path} has {size:,} bytes, more than {BYTE_LIMIT:,}: {advice}")
+
+
+def _in_obj(file: IO[bytes], size: int) -> int:
+    """Lines that begin with ``v``; counting ends where there are too many."""
+    if size < 8 * VERTEX_LIMIT:  # "v 0 0 0\n"
+        return 0
+    found, end = 0, b"\n"
+    while found <= VERTEX_LIMIT and (block := file.read(_BLOCK)):
+        text = end + block.replace(b"\r", b"\n").replace(b"\t", b" ")
+        found += text.count(b"\nv ")
+        end = text[-2:]
+    return found
+
+
+def _in_ply(file: IO[bytes], size: int) -> int:
+    header = read_header(file.read(_BLOCK))
+    return max(header.count("vertex"), header.count("face") // 4)
+
+
+def _in_off(file: IO[bytes], size: int) -> int:
+    lines = [line.partition(b"#")[0].split() for line in file.read(_BLOCK).splitlines()]
+    words = [word for line in lines for word in line][:3]
+    numbers = [int(word) for word in words if word.isdigit()]
+    return max(numbers[0], numbers[1] // 4) if len(numbers) > 1 else 0
+
+
+def _in_stl(file: IO[bytes], size: int) -> int:
+    """Corners are three a triangle, and six triangles meet in a vertex."""
+    if is_binary_stl(file.read(84), size):
+        return (size - 84) // 100
+    return size // 500  # a facet of text has some 250 bytes
+
+
+def _in_glb(file: IO[bytes], size: int) -> int:
+    head = file.read(20)
+    if head[:4] != b"glTF" or len(head) < 20:
+        return 0
+    length = struct.unpack_from("<I", head, 12)[0]
+    described = json.loads(file.read(min(length, _JSON_LIMIT)))
+    primitives = [each for mesh in described.get("meshes", ()) for each in mesh.get("primitives", ())]
+    used = {each.get("attributes", {}).get("POSITION") for each in primitives}
+    return max((described["accessors"][number]["count"] for number in used if number is not None), default=0)
+
+
+_COUNTS = {".obj": _in_obj, ".ply": _in_ply, ".off": _in_off, ".stl": _in_stl, ".glb": _in_glb}
