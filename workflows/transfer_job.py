@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.errors import MeshError, RecipeError
-from datagen.mesh_files import check_writable, frames_of
+from datagen.mesh_files import check_writable
+from datagen.mesh_sequences import frames_of
 from training.alignment import UPRIGHT, Axes, axes_of_both
 
 _ANIMATED = ".glb"
@@ -94,8 +95,13 @@ class TransferJob:
             raise MeshError(f"{taken} is one of the meshes to read, which are never written over; choose another --out")
         if len(set(outputs)) < len(outputs):
             raise MeshError(f"two frames of {self.sources[0].parent} have one name; rename them, or write a .glb")
-        for path in {outputs[0], outputs[-1]}:
-            check_writable(path)
+        if self.is_file:
+            check_writable(self.out)
+        elif self.out.exists() and not self.out.is_dir():
+            raise MeshError(f"{self.out} is a file; frames go into a folder, or into one .glb")
+        else:
+            # not yet the folder itself: it appears when the last frame is done
+            check_writable((self.out if self.out.is_dir() else self.out.parent) / self.animation.name)
 
 
 _SAME = ("fps", "refine", "picture", "viewer")

@@ -3,6 +3,7 @@
 import os
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from datagen.errors import StorageError
 from datagen.mesh import Mesh
-from datagen.mesh_files import MeshFile, read_mesh_file, write_animation, write_posed
+from datagen.mesh_files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh_glb_written import FRAME_LIMIT
+from datagen.mesh_sequences import write_animation
 from training.alignment import UPRIGHT, Axes, orientation
 from training.refinement import DEFAULT_WEIGHT
 from training.transfer import PoseTransfer
@@ -80,6 +83,10 @@ class TransferWork:
             self._animate(self._posed(), job.animation)
             return about
         with _appearing_whole(job.out) as folder:
+            if len(job.sources) > FRAME_LIMIT:
+                warn(f"no {job.animation.name}: it holds {FRAME_LIMIT:,} frames at most, and these are more")
+                deque(self._saved(folder), maxlen=0)
+                return about
             self._animate(self._saved(folder), folder / job.animation.name)
         return f"{about}, and all of them in {job.animation.name}"
 
