@@ -2,20 +2,37 @@
 
 >>> model = mlflow.pyfunc.load_model("models:/dsffnet@latest-trained")              # doctest: +SKIP
 >>> model.predict({"source": source_vertices, "target": vertices, "target_faces": faces})     # doctest: +SKIP
+
+The signature takes arrays; with ``model.unwrap_python_model()`` meshes may be named by their files, too:
+
+>>> model.unwrap_python_model().predict(None, {"source": "pose.obj", "target": "person.obj"}, {"align": True})
+... # doctest: +SKIP
 """
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import mlflow
 import numpy as np
 from mlflow.pyfunc import PythonModel
 
-from datagen.mesh import Mesh
+from datagen.errors import DsffnetError
+from datagen.mesh import Mesh, check_mesh, load_mesh
+from training.alignment import Axes, axes_of_both, orientation
 from training.transfer import PoseTransfer
 
 
+class RegistryError(DsffnetError):
+    """A registered model that MLflow does not know or cannot hand out."""
+
+
 class PoseTransferModel(PythonModel):  # type: ignore[misc]
-    """Source vertices [n, 3], target vertices [m, 3] and target faces [f, 3] in; posed vertices [m, 3] out."""
+    """Source vertices [n, 3], target vertices [m, 3] and target faces [f, 3] in; posed vertices [m, 3] out.
+
+    ``params`` are options of ``dsffnet transfer``: ``up`` and ``front`` (of both meshes, or ``source,target``),
+    ``align`` (each mesh's axes are found) and ``refine`` (weight of the target's edges; 0, the default, for none).
+    """
 
     _skip_type_hint_validation = True  # the signature validates; MLflow's type hints know no dictionary of arrays
 
@@ -23,9 +40,59 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         self._transfer = PoseTransfer.from_run(context.artifacts["weights"])
 
     def predict(self, context: Any, model_input, params=None):  # type: ignore[no-untyped-def]  # MLflow reads hints
-        source, target = (np.asarray(model_input[name], np.float64) for name in ("source", "target"))
-        faces = np.asarray(model_input["target_faces"], np.int64)
-        return np.asarray(self._transfer.pose(source, Mesh(target, faces)).vertices)
+        wanted = {"up": "Y", "front": "Z", "align": False, "refine": 0.0, **(params or {})}
+        target = _mesh(model_input, "target")
+        source = _source(model_input)
+        of_source, of_target = self._axes(source, target, wanted)
+        posed = self._transfer(
+            source=source,
+            target=target,
+            source_axes=of_source,
+            target_axes=of_target,
+            refine=float(wanted["refine"]),
+        )
+        return np.asarray(posed.vertices)
+
+    def _axes(self, source: Mesh, target: Mesh, wanted: Mapping[str, Any]) -> tuple[Axes, Axes]:
+        if not wanted["align"]:
+            return axes_of_both(str(wanted["up"]), str(wanted["front"]))
+        of_source, of_target = (orientation(self._transfer.self_errors, [m.vertices]).axes for m in (source, target))
+        return of_source, of_target
+
+
+def _mesh(model_input: Any, role: str) -> Mesh:
+    given = model_input[role]
+    if isinstance(given, str | Path):
+        return load_mesh(given)
+    mesh = Mesh(np.asarray(given, np.float64), np.asarray(model_input[f"{role}_faces"], np.int64))
+    return check_mesh(mesh, name=role)
+
+
+def _source(model_input: Any) -> Mesh:
+    """The source; of a pose no faces are asked, so that one that points nowhere wrong stands for them."""
+    given = model_input["source"]
+    if isinstance(given, str | Path):
+        return load_mesh(given)
+    return check_mesh(Mesh(np.asarray(given, np.float64), np.zeros((1, 3), np.int64)), name="source")
+
+
+def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
+    """Fetch the weights of a registered model (``models:/NAME@ALIAS`` or ``models:/NAME/VERSION``) into a folder.
+
+    Raises
+    ------
+    RegistryError
+        There is no such model there, it is none of this project's, or the server cannot be reached.
+    """
+    try:
+        found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder), tracking_uri=tracking_uri))
+    except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise RegistryError(f"{uri} cannot be had from MLflow at {tracking_uri}: {reason}") from error
+    weights = found / "artifacts" / "weights"
+    if not weights.is_dir():
+        raise RegistryError(f"{uri} at {tracking_uri} holds no weights of dsffnet; name a model that a training made")
+    return weights
 
 
 mlflow.models.set_model(PoseTransferModel())

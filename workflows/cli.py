@@ -12,6 +12,7 @@ from workflows.data_commands import add_data_commands
 from workflows.evaluated import which_checkpoint
 from workflows.recipe import load_recipe
 from workflows.sweep_command import add_sweep_options, sweep_command
+from workflows.transfer_command import add_transfer
 
 
 def main() -> None:
@@ -56,19 +57,6 @@ def evaluate_command(options: argparse.Namespace) -> None:
         print(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
 
 
-def transfer_command(options: argparse.Namespace) -> None:
-    """Pose one mesh like another."""
-    from datagen.mesh import load_mesh, save_mesh
-    from training.checkpoint import require_checkpoint
-    from training.transfer import PoseTransfer
-
-    source, target = load_mesh(options.source), load_mesh(options.target)
-    weights = require_checkpoint(Path(options.model), options.checkpoint).path
-    posed = PoseTransfer.from_run(weights)(source=source, target=target)
-    save_mesh(posed, options.out)
-    print(f"{options.out}: {len(posed.vertices):,} vertices of {options.target} in the pose of {options.source}")
-
-
 def sync_command(options: argparse.Namespace) -> None:
     """Send to MLflow what an outage kept back; repeating it changes nothing."""
     from training.record import find_records
@@ -100,8 +88,6 @@ _EXAMPLES = {
   dsffnet evaluate runs/first --data data/quickstart.zarr
   dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
   dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
-    transfer_command: """\
-  dsffnet transfer --model runs/quickstart/run --source pose.obj --target person.obj --out posed.obj""",
     sweep_command: "  dsffnet sweep --trials networks --out runs/networks",
     sync_command: """\
   dsffnet sync runs/quickstart/run
@@ -139,12 +125,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
 
-    transfer = add_command(commands, transfer_command, _EXAMPLES[transfer_command])
-    transfer.add_argument("--model", required=True, metavar="RUN", help="run folder of a training, or weights")
-    _add_checkpoint(transfer)
-    transfer.add_argument("--source", required=True, metavar="A", help="mesh in the wanted pose")
-    transfer.add_argument("--target", required=True, metavar="B", help="mesh of the wanted identity")
-    transfer.add_argument("--out", required=True, metavar="C", help="mesh to write (.obj .ply .off .glb .stl)")
+    add_transfer(commands)
 
     sync = add_command(commands, sync_command, _EXAMPLES[sync_command])
     sync.add_argument("run", metavar="RUN", help="run folder, or the folder of a whole workflow")

@@ -1,0 +1,102 @@
+"""How long a transfer takes: ``python -m benchmarks.transfer [--run RUN] [--threads 2] [--vertices 6890]``.
+
+One pair with the model loaded is a DSFFNet of the paper's widths (random weights: the time is the same) and two spheres
+of so many vertices; the median of ten, after one for warming up. The whole command is a process of its own, from its
+start to its end, with the weights of a run (the paper's widths, written for the occasion, unless --run names one); the
+median of three.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull
+
+from datagen.mesh import Mesh, save_mesh
+from training.checkpoint import save_checkpoint
+from training.inference import network_from
+from training.recipe import TrainingRecipe
+from training.refinement import DEFAULT_WEIGHT
+from training.transfer import PoseTransfer
+
+
+def main() -> None:
+    """Measure and print everything."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, help="weights of the whole command (the paper's widths)")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--vertices", type=int, default=6890)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        run = options.run or untrained_run(folder / "run")
+        source, target = sphere(options.vertices, seed=1), sphere(options.vertices, seed=2)
+        print(f"torch {torch.__version__}, CPU, {options.threads} threads, {options.vertices:,} vertices, seconds")
+        for what, seconds in inside(PoseTransfer.from_run(run), source, target).items():
+            print(f"  {what:38}{seconds:7.3f}")
+        save_mesh(source, folder / "source.obj")
+        save_mesh(target, folder / "target.obj")
+        for extra in ((), ("--refine",), ("--picture",)):
+            print(f"  {' '.join(('dsffnet transfer', *extra)):38}{whole(run, folder, extra, options.threads):7.3f}")
+
+
+def untrained_run(folder: Path) -> Path:
+    """A run of the paper's widths, with weights as they begin."""
+    recipe = TrainingRecipe()
+    about = {"step": 1, "recipe": recipe.model_dump(mode="json"), "dataset": ""}
+    save_checkpoint(folder, about=about, weights=network_from(recipe.network).state_dict(), state={}, keep=1)
+    return folder
+
+
+def sphere(vertices: int, *, seed: int) -> Mesh:
+    """Random points on a sphere and the triangles between them."""
+    points = np.random.default_rng(seed).normal(size=(vertices, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return Mesh(points, ConvexHull(points).simplices.astype(np.int64))
+
+
+def inside(transfer: PoseTransfer, source: Mesh, target: Mesh) -> dict[str, float]:
+    """Seconds of one pair with everything loaded."""
+    probe = np.repeat(source.vertices[None, :512], 24, axis=0)
+    return {
+        "one pair": median(lambda: transfer(source=source, target=target)),
+        "one pair, refined": median(lambda: transfer(source=source, target=target, refine=DEFAULT_WEIGHT)),
+        "how one mesh stands (24 ways)": median(lambda: transfer.self_errors(probe)),
+    }
+
+
+def median(work: Callable[[], object], repeats: int = 10) -> float:
+    """Seconds of a call, the first left out."""
+    taken = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken[1:])
+
+
+def whole(run: Path, folder: Path, extra: tuple[str, ...], threads: int) -> float:
+    """Seconds of the command, from nothing to a file."""
+    words = ["--model", run, folder / "source.obj", folder / "target.obj", "-o", folder / "out.obj", *extra]
+    command = [sys.executable, "-m", "workflows.cli", "transfer", *map(str, words)]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+
+    def work() -> None:
+        subprocess.run(command, check=True, capture_output=True, env=environment)
+
+    return median(work, repeats=3)
+
+
+if __name__ == "__main__":
+    main()

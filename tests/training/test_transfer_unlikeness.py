@@ -1,0 +1,87 @@
+"""What a person is told about a mesh that its network has not met, and that nothing is said of one that it has."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.generate import generate
+from datagen.mesh import Mesh
+from tests.support.recipes import tiny_dataset, tiny_training
+from training.alignment import EVERY_AXES, UPRIGHT, Axes, Orientation
+from training.checkpoint import require_checkpoint
+from training.trainer import train
+from training.unlikeness import Seen, part_sizes, remarks, seen_by
+
+GRID = np.stack(np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 2, 15), [0.0, 0.4], indexing="ij"), -1).reshape(-1, 3)
+STRIP = np.stack([np.arange(238), np.arange(1, 239), np.arange(2, 240)], axis=1)
+BODY = Mesh(GRID, STRIP)
+GOOD = Orientation(np.full(24, 0.05) - 0.049 * (np.arange(24) == 0))
+SEEN = Seen((200, 300), np.array([0.4, 0.9, 0.1]), np.array([0.8, 1.0, 0.3]))
+
+
+def told(
+    mesh: Mesh,
+    *,
+    way: Orientation = GOOD,
+    axes: Axes = UPRIGHT,
+    chosen: bool = False,
+    seen: Seen | None = SEEN,
+) -> str:
+    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, chosen=chosen, seen=seen))
+
+
+@pytest.mark.parametrize("seen", [SEEN, None])
+def test_nothing_is_said_of_a_mesh_as_in_training(seen: Seen | None) -> None:
+    assert told(BODY, seen=seen) == ""
+
+
+def test_a_mesh_that_stands_otherwise_is_told_how_to_be_turned() -> None:
+    errors = np.full(24, 0.05)
+    lying = EVERY_AXES.index(Axes("Z", "-Y"))
+    errors[lying] = 0.001
+    found = told(BODY, way=Orientation(errors))
+    assert "A seems to stand Z up, facing -Y" in found and "--align, or --up=Z --front=-Y" in found
+    assert told(BODY, way=Orientation(errors), axes=Axes("Z", "-Y"), chosen=True, seen=None) == ""
+
+
+def test_a_mesh_that_the_network_does_not_know_in_any_way() -> None:
+    assert "comes back from the network as another shape (PMD 0.050" in told(BODY, way=Orientation(np.full(24, 0.05)))
+
+
+def test_parts_are_counted_over_seams() -> None:
+    doubled = Mesh(np.concatenate([GRID, GRID[:3], GRID + 5]), np.concatenate([STRIP, [[240, 241, 242]]]))
+    sizes = part_sizes(doubled)
+    assert sizes[0] == 240 and sizes[1:].tolist() == [1] * 240
+
+
+def test_two_bodies_in_one_file() -> None:
+    vertices = np.concatenate([GRID, GRID + 3, GRID - 3])
+    three = Mesh(vertices, np.concatenate([STRIP, STRIP + 240, STRIP + 480]))
+    assert "A has 3 separate parts, the largest with 33% of the vertices" in told(three, seen=None)
+
+
+def test_a_stray_vertex_and_a_lost_axis() -> None:
+    stray = np.concatenate([GRID, [[0, 90.0, 0]]])
+    assert "A has 1 vertices far from all others" in told(Mesh(stray, STRIP), seen=None)
+    assert "A is nearly flat" in told(Mesh(GRID * (1, 1, 1e-4), STRIP))
+
+
+def test_proportions_and_vertex_counts_beyond_training() -> None:
+    assert "box of 1.00 x 0.50 x 0.10" in told(Mesh(GRID * (4, 1, 1), STRIP))
+    assert "A has 240 vertices, training saw 5,000" in told(BODY, seen=Seen((5000, 5000), SEEN.least, SEEN.most))
+
+
+def test_what_a_run_saw_is_asked_of_its_dataset_while_it_is_there(tmp_path: Path) -> None:
+    data = tmp_path / "leg.zarr"
+    generate(tiny_dataset(), str(data))
+    train(tiny_training(steps=1), data=str(data), run=tmp_path / "run")
+    (tmp_path / "run" / "provenance.json").write_text(json.dumps({"dataset": {"url": str(data)}}))
+    weights = require_checkpoint(tmp_path / "run").path
+    seen = seen_by(weights)
+    assert seen is not None and seen.vertices == (32, 32)
+    assert (seen.least <= seen.most).all() and seen.most.max() == 1
+    assert seen_by(tmp_path / "elsewhere" / "weights.safetensors") is None
+    data.rename(tmp_path / "moved.zarr")
+    assert seen_by(weights) is None

@@ -1,0 +1,183 @@
+"""``dsffnet transfer`` as a person types it: what is written and said, and that a failure leaves nothing behind."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.errors import DsffnetError, MeshError, RecipeError, StorageError
+from datagen.generate import generate
+from datagen.mesh import Mesh, load_mesh, save_mesh
+from datagen.store import open_dataset
+from tests.support.commands import command, fails
+from tests.support.recipes import tiny_dataset, tiny_training
+from training.alignment import Axes
+from training.checkpoint import CheckpointError
+from training.trainer import train
+from training.transfer import PoseTransfer
+from workflows import cli
+
+Transfer = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny run, and in its folder meshes: pose.obj, person.obj, and a walk of 12 frames."""
+    folder = tmp_path_factory.mktemp("transfer")
+    generate(tiny_dataset(), str(folder / "leg.zarr"))
+    train(tiny_training(), data=str(folder / "leg.zarr"), run=folder / "run")
+    dataset = open_dataset(str(folder / "leg.zarr"))
+    save_mesh(Mesh(dataset.vertices(3, 7), dataset.faces(3)), folder / "pose.obj")
+    save_mesh(Mesh(dataset.vertices(4, 0), dataset.faces(4)), folder / "person.obj")
+    for frame in range(12):
+        vertices = dataset.vertices(3, frame % 10) + np.float32(0.1 * frame)
+        save_mesh(Mesh(vertices, dataset.faces(3)), folder / "walk" / f"frame_{frame}.ply")
+    return folder / "run"
+
+
+@pytest.fixture
+def transfer(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Transfer:
+    """Run the command in this process, from the folder of the meshes; files go to tmp_path where they are ``out``."""
+    monkeypatch.chdir(run.parent)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+
+    def call(*words: object) -> None:
+        options = cli._parser().parse_args(["transfer", *map(str, words), "--model", str(run)])
+        options.command(options)
+
+    return call
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_a_pair_with_picture_and_page(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "posed.obj", "--picture", "--viewer")
+    assert files(tmp_path) == ["posed.html", "posed.obj", "posed.png"]
+    source, target = load_mesh("pose.obj"), load_mesh("person.obj")
+    expected = PoseTransfer.from_run(run)(source=source, target=target)
+    assert np.allclose(load_mesh(tmp_path / "posed.obj").vertices, expected.vertices, atol=1e-5)
+
+
+def test_both_ways_of_naming_the_meshes_are_one(transfer: Transfer, tmp_path: Path) -> None:
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "a.ply")
+    transfer("--target", "person.obj", "--source", "pose.obj", "--out", tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_refining_is_off_unless_asked(transfer: Transfer, tmp_path: Path) -> None:
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "a.obj")
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "b.obj", "--refine")
+    plain, refined = (load_mesh(tmp_path / name).vertices for name in ("a.obj", "b.obj"))
+    assert abs(plain - refined).max() > 1e-4
+
+
+def test_axes_by_hand_give_the_same_body_lying_as_its_file(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+    axes = Axes("Z", "-Y")
+    target = load_mesh("person.obj")
+    save_mesh(Mesh(axes.restored(target.vertices), target.faces), tmp_path / "lying.obj")
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "a.obj")
+    transfer("pose.obj", tmp_path / "lying.obj", "-o", tmp_path / "b.obj", "--up", "Y,Z", "--front", "Z,-Y")
+    standing, lying = (load_mesh(tmp_path / name).vertices for name in ("a.obj", "b.obj"))
+    assert np.allclose(axes.turned(lying), standing, atol=1e-5)
+
+
+def test_a_folder_becomes_a_folder_named_after_the_frames_and_one_animation(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    transfer("walk", "person.obj", "-o", tmp_path / "out" / "walked", "--smooth", "5", "--picture")
+    frames = sorted(f"frame_{number}.obj" for number in range(12))
+    assert files(tmp_path / "out" / "walked") == ["animation.glb", *frames]
+    assert files(tmp_path / "out") == ["walked", "walked.png", *(f"walked/{n}" for n in ["animation.glb", *frames])]
+    said = capsys.readouterr()
+    assert "12 frames of person.obj" in said.out and "transfer" in said.err and "12/12" in said.err
+
+
+def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path) -> None:
+    transfer("walk/frame_*.ply", "person.obj", "-o", tmp_path / "walked.glb")
+    assert files(tmp_path) == ["walked.glb"]
+
+
+def test_frames_come_in_their_numbers_order(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+    """Frame 10 comes after frame 9: the walk goes on, so that the output of frame 10 is the farthest but one."""
+    transfer("walk", "person.obj", "-o", tmp_path / "walked")
+    sources = [load_mesh(f"walk/frame_{number}.ply") for number in range(12)]
+    expected = list(PoseTransfer.from_run(run).sequence(sources, load_mesh("person.obj")))
+    found = load_mesh(tmp_path / "walked" / "frame_10.obj")
+    assert np.allclose(found.vertices, expected[10].vertices, atol=1e-5)
+
+
+def test_a_broken_frame_leaves_nothing_behind(transfer: Transfer, tmp_path: Path) -> None:
+    walk = tmp_path / "walk"
+    for number in range(3):
+        save_mesh(load_mesh("pose.obj"), walk / f"{number}.obj")
+    (walk / "1.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    before = files(tmp_path)
+    for out in ("walked", "walked.glb"):
+        with pytest.raises(MeshError, match=r"1\.obj"):
+            transfer(walk, "person.obj", "-o", tmp_path / out)
+        assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "says"),
+    [
+        (("pose.obj", "person.obj", "-o", "person.obj"), MeshError, "never written over"),
+        (("pose.obj", "person.obj", "-o", "./pose.obj"), MeshError, "never written over"),
+        (("walk/*.ply", "walk/frame_3.ply", "-o", "walk"), MeshError, "never written over"),
+        (("pose.obj", "-o", "x.obj"), RecipeError, "name two meshes"),
+        (("pose.obj", "person.obj", "--source", "pose.obj", "-o", "x.obj"), RecipeError, "name two meshes"),
+        (("pose.obj", "person.obj", "-o", "x.xyz"), MeshError, "x.xyz"),
+        (("none.obj", "person.obj", "-o", "x.obj"), MeshError, "none.obj"),
+        (("pose.obj", "person.obj", "-o", "pose.obj/x.obj"), StorageError, "pose.obj"),
+        (("pose.obj", "person.obj", "-o", "x.obj", "--up", "W"), RecipeError, "'W' is no axis"),
+        (("pose.obj", "person.obj", "-o", "x.obj", "--align", "--up", "Z"), RecipeError, "--align finds"),
+        (("walk", "person.obj", "-o", "x.glb", "--smooth", "much"), RecipeError, "'much'"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_the_weights_are_read(
+    transfer: Transfer,
+    words: tuple[str, ...],
+    error: type[DsffnetError],
+    says: str,
+    run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(PoseTransfer, "from_run", None)
+    before = files(run.parent)
+    with pytest.raises(error, match=says):
+        transfer(*words)
+    assert files(run.parent) == before
+
+
+def test_models_and_servers_that_are_not_there(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.parent)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+
+    def call(model: str) -> None:
+        options = cli._parser().parse_args(
+            ["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model]
+        )
+        options.command(options)
+
+    with pytest.raises(CheckpointError, match="no usable checkpoint"):
+        call("nowhere")
+    with pytest.raises(RecipeError, match="--tracking-uri"):
+        call("models:/dsffnet@latest-trained")
+    assert not files(tmp_path)
+
+
+def test_one_line_and_an_exit_status(run: Path, tmp_path: Path) -> None:
+    words = ("--model", run, run.parent / "none.obj", run.parent / "person.obj", "-o", tmp_path / "x.obj")
+    fails(command("transfer", *words), 1, "none.obj")
+
+
+def test_a_transfer_needs_neither_ray_nor_mlflow_nor_pandas(run: Path, tmp_path: Path) -> None:
+    banned = ", ".join(f"'{name}': None" for name in ("ray", "mlflow", "pandas", "anny", "smplx"))
+    (tmp_path / "sitecustomize.py").write_text(f"import sys\nsys.modules.update({{{banned}}})\n")
+    words = ("--model", run, run.parent / "pose.obj", run.parent / "person.obj", "-o", tmp_path / "x.obj")
+    done = command("transfer", *words, PYTHONPATH=f"{tmp_path}:{Path(cli.__file__).parents[1]}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "x.obj").is_file()

@@ -1,0 +1,175 @@
+"""Where a mesh is unlike what a network was trained on, in words that say what to do.
+
+What the network saw is asked of the dataset that the run names, while it is still where it was; weights that were sent
+elsewhere are judged by what holds for any of them.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from datagen.errors import DatasetError, StorageError
+from datagen.mesh import Mesh, bounding_box, edges_of
+from training.alignment import Axes, Orientation
+
+if TYPE_CHECKING:
+    from datagen.store import Dataset
+
+Floats = NDArray[np.floating]
+_TIMES_AS_MANY = 10.0  # vertices than training saw
+_PROPORTIONS_BEYOND = 1.5  # times the range of training
+_STRAY_SHARE, _STRAY_TIMES = 0.01, 2.0  # so few vertices that make the box so many times larger
+_FLAT = 0.02  # shortest over longest edge of the box
+_MAIN_SHARE = 0.5  # of the vertices, in the largest connected part
+_POOR_ERROR = 0.01  # PMD of a mesh onto itself: 0.1 of half the box, in every coordinate
+_POSES_LOOKED_AT = 3
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a network was trained on: fewest and most vertices, and box edges [3] over the longest, least and most."""
+
+    vertices: tuple[int, int]
+    least: Floats
+    most: Floats
+
+
+def seen_by(weights: Path) -> Seen | None:
+    """What the dataset of a run holds, None where it cannot be had; ``weights`` is a checkpoint's folder or file."""
+    try:
+        url = _dataset_of(weights)
+        return _seen_in(url) if url and Path(url).is_dir() else None
+    except (OSError, ValueError, KeyError, DatasetError, StorageError):  # a dataset that is half gone is none
+        return None
+
+
+def _dataset_of(weights: Path) -> str | None:
+    for folder in weights.absolute().parents:
+        about = folder / "provenance.json"
+        if about.is_file():
+            return str(json.loads(about.read_text())["dataset"]["url"])
+        if folder.name not in ("checkpoints",) and not folder.name.startswith("step-"):
+            return None
+    return None
+
+
+def _seen_in(url: str) -> Seen:
+    from datagen.store import open_dataset  # it brings zarr, which a transfer does not need otherwise
+
+    dataset = open_dataset(url)
+    identities = dataset.identities("training")
+    shapes = np.array([_proportions(mesh) for who in identities for mesh in _some_poses(dataset, who)])
+    counts = [dataset.vertex_count(who) for who in identities]
+    return Seen((min(counts), max(counts)), shapes.min(axis=0), shapes.max(axis=0))
+
+
+def _some_poses(dataset: "Dataset", identity: int) -> Floats:
+    poses = dataset.grid.poses_of(identity)
+    chosen = np.linspace(0, len(poses) - 1, _POSES_LOOKED_AT).astype(int)
+    return dataset.vertices(identity, poses[chosen])
+
+
+def remarks(mesh: Mesh, *, name: str, axes: Axes, way: Orientation, chosen: bool, seen: Seen | None) -> Iterator[str]:
+    """One line for everything about a mesh that its network has not met.
+
+    Parameters
+    ----------
+    mesh
+        As it is in its file.
+    name
+        What the lines call it.
+    axes, way, chosen
+        How it is taken to stand, how well it comes back in every way of standing, and whether a person said so.
+    seen
+        What the network saw, None where that is not known.
+    """
+    upright = axes.turned(mesh.vertices)
+    yield from _about_standing(name, axes, way, chosen=chosen)
+    yield from _about_parts(name, mesh)
+    yield from _about_box(name, upright, seen)
+    yield from _about_count(name, len(upright), seen)
+
+
+def _about_standing(name: str, axes: Axes, way: Orientation, *, chosen: bool) -> Iterator[str]:
+    if not chosen and way.is_unlike_training and way.axes != axes:
+        found = way.axes
+        yield (
+            f"{name} seems to stand {found}, the training data {axes}: add --align, or --up={found.up} "
+            f"--front={found.front} for that mesh"
+        )
+    elif way.error(axes) > _POOR_ERROR:
+        yield (
+            f"{name} comes back from the network as another shape (PMD {way.error(axes):.3f} onto itself): it is "
+            "unlike the bodies of training, or stands otherwise; look at --picture, or try --align"
+        )
+
+
+def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
+    sizes = part_sizes(mesh)
+    if sizes[0] < _MAIN_SHARE * sizes.sum():
+        yield (
+            f"{name} has {len(sizes)} separate parts, the largest with {sizes[0] / sizes.sum():.0%} of the vertices: "
+            "one body is posed as a whole; save one body without props as a file of its own"
+        )
+
+
+def part_sizes(mesh: Mesh) -> NDArray[np.int64]:
+    """Vertices in each connected part, most first; vertices at one place count as one, as at the seams of textures."""
+    points, point_of = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    edges = edges_of(point_of.ravel()[mesh.faces])
+    links = csr_matrix((np.ones(len(edges)), edges.T), shape=(len(points), len(points)))
+    return np.sort(np.bincount(connected_components(links, directed=False)[1]))[::-1]
+
+
+def _about_box(name: str, upright: Floats, seen: Seen | None) -> Iterator[str]:
+    shape, strays = _proportions(upright), _strays(upright)
+    if strays:
+        yield f"{name} has {strays} vertices far from all others, which shrink the body in its box: remove them"
+    elif shape.min() < _FLAT:
+        yield f"{name} is nearly flat (box {_told(shape)} of its longest edge): is one of its axes lost?"
+    elif seen and _is_beyond(shape, seen):
+        yield (
+            f"{name} has a box of {_told(shape)} (width, height, depth over the longest), training saw "
+            f"{_told(seen.least)} to {_told(seen.most)}: expect less, or train on such bodies"
+        )
+
+
+def _is_beyond(shape: Floats, seen: Seen) -> bool:
+    return bool((shape > seen.most * _PROPORTIONS_BEYOND).any() or (shape < seen.least / _PROPORTIONS_BEYOND).any())
+
+
+def _about_count(name: str, count: int, seen: Seen | None) -> Iterator[str]:
+    if seen is None:
+        return
+    fewest, most = seen.vertices
+    if count > most * _TIMES_AS_MANY or count < fewest / _TIMES_AS_MANY:
+        known = f"{fewest:,}" if fewest == most else f"{fewest:,} to {most:,}"
+        yield (
+            f"{name} has {count:,} vertices, training saw {known}: its surface may come out dented; add --refine, "
+            "or train on bodies of about as many"
+        )
+
+
+def _strays(vertices: Floats) -> int:
+    """How many vertices, few as they are, make the box much larger than that of the others; 0 where none do."""
+    low, high = np.quantile(vertices, (_STRAY_SHARE / 2, 1 - _STRAY_SHARE / 2), axis=0)
+    middle, half = (low + high) / 2, float((high - low).max()) / 2
+    if half == 0 or float(bounding_box(vertices).half) < _STRAY_TIMES * half:
+        return 0
+    return int((np.abs(vertices - middle).max(axis=1) > _STRAY_TIMES * half).sum())
+
+
+def _proportions(vertices: Floats) -> Floats:
+    edges = np.ptp(vertices, axis=0)
+    return np.asarray(edges / max(float(edges.max()), 1e-30))
+
+
+def _told(shape: Floats) -> str:
+    return " x ".join(f"{edge:.2f}" for edge in shape)

@@ -1,0 +1,123 @@
+"""What ``dsffnet transfer`` is asked for, in paths and numbers, and whether its places can be written."""
+
+import argparse
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.errors import MeshError, RecipeError
+from datagen.mesh_files import check_writable
+from datagen.mesh_sequences import frames_of
+from training.alignment import UPRIGHT, Axes, axes_of_both
+
+_ANIMATED = ".glb"
+
+
+@dataclass(frozen=True)
+class TransferJob:
+    """One transfer, or one for each frame of a sequence.
+
+    ``axes``: how source and target stand, None to find it; ``is_told``: a person has said so; ``window``: frames of
+    the smoothing; what follows is as on the command line.
+    """
+
+    sources: list[Path]
+    target: Path
+    out: Path
+    is_sequence: bool
+    axes: tuple[Axes, Axes] | None = (UPRIGHT, UPRIGHT)
+    is_told: bool = False
+    window: int = 0
+    fps: float = 30.0
+    refine: bool = False
+    picture: bool = False
+    viewer: bool = False
+
+    @classmethod
+    def from_options(cls, options: argparse.Namespace) -> "TransferJob":
+        """The job of a command line.
+
+        Raises
+        ------
+        RecipeError
+            The options do not fit together.
+        MeshError
+            The source names no frames.
+        """
+        source, target = _two_meshes(options)
+        if options.align and (options.up or options.front):
+            raise RecipeError("--align finds how the meshes stand; leave it out to say it by --up and --front")
+        of_source, of_target = axes_of_both(options.up or UPRIGHT.up, options.front or UPRIGHT.front)
+        is_sequence = source.is_dir() or any(sign in source.name for sign in "*?%#")
+        return cls(
+            sources=frames_of(source) if is_sequence else [source],
+            target=target,
+            out=Path(options.out),
+            is_sequence=is_sequence,
+            axes=None if options.align else (of_source, of_target),
+            is_told=bool(options.up or options.front),
+            window=_frames_of_window(options.smooth, options.fps),
+            **{name: getattr(options, name) for name in _SAME},
+        )
+
+    @property
+    def is_file(self) -> bool:
+        """Whether one file is written, not a folder of frames."""
+        return not self.is_sequence or self.out.suffix.lower() == _ANIMATED
+
+    @property
+    def animation(self) -> Path:
+        """The animated GLB of a sequence."""
+        return self.out if self.is_file else self.out / f"animation{_ANIMATED}"
+
+    def beside(self, suffix: str) -> Path:
+        """A file beside the output, named after it."""
+        return self.out.with_name(f"{self.out.stem if self.is_file else self.out.name}{suffix}")
+
+    def frame_file(self, source: Path) -> Path:
+        """The file of one frame: named after the source's, of the target's format."""
+        return self.out / f"{source.stem}{self.target.suffix.lower()}"
+
+    def check_places(self) -> None:
+        """Refuse, before any work, what could not be written at its end, or would write over what is read.
+
+        Raises
+        ------
+        MeshError
+            An output is an input, or of an unknown format.
+        StorageError
+            A place cannot be written.
+        """
+        read = {path.resolve() for path in (*self.sources, self.target)}
+        outputs = [self.out] if self.is_file else [self.animation, *map(self.frame_file, self.sources)]
+        taken = next((path for path in outputs if path.resolve() in read), None)
+        if taken is not None:
+            raise MeshError(f"{taken} is one of the meshes to read, which are never written over; choose another --out")
+        if len(set(outputs)) < len(outputs):
+            raise MeshError(f"two frames of {self.sources[0].parent} have one name; rename them, or write a .glb")
+        if self.is_file:
+            check_writable(self.out)
+        elif self.out.exists() and not self.out.is_dir():
+            raise MeshError(f"{self.out} is a file; frames go into a folder, or into one .glb")
+        else:
+            # not yet the folder itself: it appears when the last frame is done
+            check_writable((self.out if self.out.is_dir() else self.out.parent) / self.animation.name)
+
+
+_SAME = ("fps", "refine", "picture", "viewer")
+
+
+def _two_meshes(options: argparse.Namespace) -> tuple[Path, Path]:
+    named = [path for path in (options.source, options.target) if path]
+    given = [*options.paths, *named]
+    if len(given) != 2 or len(named) == 1:
+        raise RecipeError("name two meshes: --source A --target B, or both in this order: SOURCE TARGET")
+    return Path(given[0]), Path(given[1])
+
+
+def _frames_of_window(word: str, fps: float) -> int:
+    """``7`` frames, or ``0.2s`` at so many frames a second."""
+    found = re.fullmatch(r"(\d+)|(\d*\.?\d+)\s*s", word.strip())
+    if found is None:
+        raise RecipeError(f"--smooth {word!r} is neither a number of frames such as 7 nor a time such as 0.2s")
+    return int(found[1]) if found[1] else round(float(found[2]) * fps)

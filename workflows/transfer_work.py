@@ -1,0 +1,162 @@
+"""A transfer at work: how the meshes stand, what to warn of, the frames, and what a person looks at."""
+
+import os
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.errors import StorageError
+from datagen.mesh import Mesh
+from datagen.mesh_files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh_glb_written import FRAME_LIMIT
+from datagen.mesh_sequences import write_animation
+from training.alignment import UPRIGHT, Axes, orientation
+from training.refinement import DEFAULT_WEIGHT
+from training.transfer import PoseTransfer
+from training.unlikeness import remarks, seen_by
+from workflows.progress import bar
+from workflows.transfer_job import TransferJob
+
+if TYPE_CHECKING:
+    from training.transfer_pictures import NamedMesh
+
+_SHOWN_FRAMES = 4  # of a sequence, in its picture
+_VOTING_FRAMES = 3  # of a sequence, on how it stands
+
+
+def warn(line: str) -> None:
+    """One line on standard error."""
+    print(f"warning: {line}", file=sys.stderr)
+
+
+class TransferWork:
+    """A job whose meshes are read and whose network is loaded."""
+
+    def __init__(self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile) -> None:
+        """``first`` is the source, or the first frame of a sequence."""
+        self.job, self.transfer, self.first, self.target = job, transfer, first, target
+        self.axes = job.axes or (UPRIGHT, UPRIGHT)
+        self._shown: dict[int, Mesh] = {}
+
+    def settle_axes(self, weights: Path) -> None:
+        """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
+        errors = self.transfer.self_errors
+        ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
+        self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
+        chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
+        meshes = {str(self.job.sources[0]): self.first, str(self.job.target): self.target.mesh}
+        for (name, mesh), axes, way in zip(meshes.items(), self.axes, ways, strict=True):
+            for line in remarks(mesh, name=name, axes=axes, way=way, chosen=chosen, seen=seen):
+                warn(line)
+
+    def run(self) -> str:
+        """Write everything; what was done, in a line."""
+        done = self._write_sequence() if self.job.is_sequence else self._write_pair()
+        if self.job.picture or self.job.viewer:
+            self._draw()
+        return done
+
+    def _votes(self) -> list[NDArray[np.floating]]:
+        count = len(self.job.sources)
+        others = {count * place // _VOTING_FRAMES for place in range(1, _VOTING_FRAMES)} - {0}
+        return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
+
+    def _source(self, number: int) -> Mesh:
+        return self.first if number == 0 else read_mesh_file(self.job.sources[number]).mesh
+
+    def _write_pair(self) -> str:
+        job, posed = self.job, next(self._posed())
+        self._write_posed(posed, job.out)
+        return f"{job.out}: {len(posed.vertices):,} vertices of {job.target} in the pose of {job.sources[0]}"
+
+    def _write_sequence(self) -> str:
+        job = self.job
+        about = f"{job.out}: {len(job.sources)} frames of {job.target}"
+        if job.is_file:
+            self._animate(self._posed(), job.animation)
+            return about
+        with _appearing_whole(job.out) as folder:
+            if len(job.sources) > FRAME_LIMIT:
+                warn(f"no {job.animation.name}: it holds {FRAME_LIMIT:,} frames at most, and these are more")
+                deque(self._saved(folder), maxlen=0)
+                return about
+            self._animate(self._saved(folder), folder / job.animation.name)
+        return f"{about}, and all of them in {job.animation.name}"
+
+    def _animate(self, frames: Iterable[Mesh], out: Path) -> None:
+        vertices = (frame.vertices for frame in frames)
+        write_animation(self.target, vertices, out, frames_per_second=self.job.fps)
+
+    def _saved(self, folder: Path) -> Iterator[Mesh]:
+        """The frames, each written to its file as it passes."""
+        for number, posed in enumerate(self._posed()):
+            name = self.job.frame_file(self.job.sources[number]).name
+            self._write_posed(posed, folder / name, quiet=number > 0)
+            yield posed
+
+    def _write_posed(self, posed: Mesh, out: Path, *, quiet: bool = False) -> None:
+        for lost in write_posed(self.target, posed.vertices, out):
+            if not quiet:
+                warn(lost)
+
+    def _posed(self) -> Iterator[Mesh]:
+        """The output of every frame; those that the picture shows are kept."""
+        count = len(self.job.sources)
+        kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
+        frames = self.transfer.sequence(
+            map(self._source, range(count)),
+            self.target.mesh,
+            smooth=self.job.window,
+            refine=DEFAULT_WEIGHT if self.job.refine else 0.0,
+            source_axes=self.axes[0],
+            target_axes=self.axes[1],
+        )
+        passing = bar(frames, total=count, what="transfer", unit="frame") if self.job.is_sequence else frames
+        for number, posed in enumerate(passing):
+            if number in kept:
+                self._shown[number] = posed
+            yield posed
+
+    def _draw(self) -> None:
+        from training.transfer_pictures import shown, write_page, write_picture
+
+        job = self.job
+        rows = [
+            shown(
+                _upright(self._source(number), self.axes[0], job.sources[number]),
+                _upright(self.target.mesh, self.axes[1], job.target),
+                _upright(posed, self.axes[1], job.frame_file(job.sources[number]) if job.is_sequence else job.out),
+            )
+            for number, posed in self._shown.items()
+        ]
+        if job.picture:
+            write_picture(rows, job.beside(".png"))
+        if job.viewer:
+            write_page(rows, job.beside(".html"))
+
+
+def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
+    from training.transfer_pictures import NamedMesh  # it brings matplotlib, which a transfer does not need otherwise
+
+    return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
+
+
+@contextmanager
+def _appearing_whole(out: Path) -> Iterator[Path]:
+    """A folder beside ``out`` to write into, whose files move there only if the block succeeds."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+            yield Path(folder)
+            out.mkdir(exist_ok=True)
+            for path in sorted(Path(folder).iterdir()):
+                os.replace(path, out / path.name)
+    except OSError as error:
+        raise StorageError(f"could not write {out}: {error.strerror or error}") from error
