@@ -6,11 +6,17 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from datagen.errors import DatasetError
-from workflows.commands import add_command
+from workflows.commands import Command, add_command
+from workflows.comparison_command import ablation_command, add_comparison_options, compare_command
+from workflows.comparison_plan import Kind
 from workflows.console import add_recipe_options, add_tracking_option, guarded, server_of, server_of_record
 from workflows.data_commands import add_data_commands
 from workflows.evaluated import which_checkpoint
+from workflows.generalisation_command import EXAMPLES as GENERALISATION_EXAMPLES
+from workflows.generalisation_command import add_generalisation_options, generalisation_command
 from workflows.recipe import load_recipe
+from workflows.robustness_command import EXAMPLES as ROBUSTNESS_EXAMPLES
+from workflows.robustness_command import add_robustness_options, robustness_command
 from workflows.sweep_command import add_sweep_options, sweep_command
 from workflows.transfer_command import add_transfer
 
@@ -80,7 +86,7 @@ def recipe_command(options: argparse.Namespace) -> None:
     print(yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False), end="")
 
 
-_EXAMPLES = {
+_EXAMPLES: dict[Command, str] = {
     train_command: """\
   dsffnet train --recipe quickstart --data data/quickstart.zarr --out runs/first
   dsffnet train --recipe quickstart --set training.steps=8000 --data data/quickstart.zarr --out runs/longer""",
@@ -89,6 +95,10 @@ _EXAMPLES = {
   dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
   dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
     sweep_command: "  dsffnet sweep --trials networks --out runs/networks",
+    compare_command: """\
+  dsffnet compare --out runs/compare
+  dsffnet compare --recipe animals-small --set training.steps=500""",
+    ablation_command: "  dsffnet ablation --out runs/ablation",
     sync_command: """\
   dsffnet sync runs/quickstart/run
   dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000""",
@@ -97,6 +107,9 @@ _EXAMPLES = {
   dsffnet recipe --recipe mine.yaml --set training.batch=16
   dsffnet recipe --set training=npt-paper training.steps=100""",
 }
+
+
+_COMPARED: dict[Command, Kind] = {compare_command: "comparison", ablation_command: "ablation"}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -124,6 +137,10 @@ def _parser() -> argparse.ArgumentParser:
     add_tracking_option(evaluate)
 
     add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
+    for compared, kind in _COMPARED.items():
+        add_comparison_options(add_command(commands, compared, _EXAMPLES[compared], takes_recipe=True), kind)
+    add_robustness_options(add_command(commands, robustness_command, ROBUSTNESS_EXAMPLES))
+    add_generalisation_options(add_command(commands, generalisation_command, GENERALISATION_EXAMPLES))
 
     add_transfer(commands)
 
