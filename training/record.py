@@ -7,6 +7,8 @@ FOLDER/record.json: name, kind, parent, parameters, dataset, status, times, arti
 import getpass
 import json
 import os
+import re
+import shlex
 import sys
 import time
 import uuid
@@ -76,7 +78,7 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         kind=kind,
         parent=os.path.relpath(parent, folder) if parent else None,
         parameters=parameters,
-        tags={"mlflow.user": _user(), "mlflow.source.name": sys.argv[0], "mlflow.source.type": "LOCAL"},
+        tags=_tags() if parent else _tags() | {"dsffnet.command": _command()},
         started=before.started if before else _now(),
         id=(before.id if before else "") or uuid.uuid4().hex,
     )
@@ -134,6 +136,17 @@ def _has_parent(folder: Path) -> bool:
 def _start_of(folder: Path) -> int:
     record = read_record(folder)
     return record.started if record else 0
+
+
+def _tags() -> dict[str, str]:
+    return {"mlflow.user": _user(), "mlflow.source.name": sys.argv[0], "mlflow.source.type": "LOCAL"}
+
+
+def _command() -> str:
+    """The command line, without passwords in URLs: it is shown to whoever sees the server."""
+    program, *words = sys.argv
+    start = ["python", program] if program.endswith(".py") else [Path(program).name]
+    return re.sub(r"://[^/@\s]+@", "://", shlex.join([*start, *words]))
 
 
 def _user() -> str:

@@ -11,6 +11,7 @@ from training.report import write_report
 from training.report_blocks import Block, Code, Page, Picture, Section, Table, Text
 from training.report_inline import plain
 from training.report_origin import what_was_run
+from training.table_formats import emphasised
 from workflows.comparison_evaluation import FOLDER, read_inference
 from workflows.comparison_plan import ComparisonPlan
 from workflows.comparison_tables import NamedTable, tables_of
@@ -41,7 +42,7 @@ def write_comparison_report(plan: ComparisonPlan, out: Path, runs: Mapping[str, 
 
 
 def _table(table: NamedTable) -> Block:
-    return Table(table.lines, caption=table.title, notes=table.notes)
+    return Table(emphasised(table.lines), caption=plain(table.title), notes=table.notes)
 
 
 def _figures(folder: Path) -> list[Block]:

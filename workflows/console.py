@@ -22,6 +22,8 @@ from workflows.recipe import describe_fields, known_recipes
 log = logging.getLogger(__name__)
 _OWN = (
     "recipe.yaml",
+    "report.html",
+    "report.md",
     "record.json",
     "mlflow.json",
     "stages",
@@ -237,6 +239,7 @@ def closing_words(out: Path, server: Server) -> str:
     return f"""
 {table}
 Where everything lies
+  report        {shown}/report.html, report.md  (all of this on one page, with cards of data and model)
   pictures      {here}/figures/examples.png, training-curve.png
   viewer        {here}/viewer.html  (turn and zoom; open it in a browser)
   meshes        {here}/meshes/*.glb

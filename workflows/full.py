@@ -23,6 +23,7 @@ from datagen.store import open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.record import read_record, update_record
+from training.report import NAMES, report_is_current, workflow_report
 from training.tracking import Mirror
 from workflows.cluster import ray_cluster, require_reachable
 from workflows.console import alone_in, closing_words, guarded, server_of, start_over, workflow_parser
@@ -88,6 +89,8 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
         )
         for stage in (generate, train, evaluate):
             run_stage(stage, out=out, before=begin)
+        report = Stage("report", depends_on=sections, intact=lambda: report_is_current(out), work=lambda: _report(out))
+        run_stage(report, out=out, before=lambda: None)
 
 
 def _refuse_conflicts(recipe: WorkflowRecipe, data: str, run: Path) -> None:
@@ -123,6 +126,14 @@ def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path) -> None:
         metrics=child.metrics,
         tags=parent.tags | {"mlflow.note.content": (evaluation / "tables.md").read_text()},
     )
+
+
+def _report(out: Path) -> None:
+    """The report of the whole, first among what the parent record shows."""
+    workflow_report(out)
+    record = read_record(out)
+    assert record is not None
+    update_record(out, artifacts=[*NAMES, *(name for name in record.artifacts if name not in NAMES)])
 
 
 if __name__ == "__main__":

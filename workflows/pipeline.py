@@ -26,6 +26,7 @@ from training.launch import launch
 from training.ranks import TrainingError, TrainingStopped
 from training.recipe import EvaluationRecipe, TrainingRecipe
 from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
+from training.report_origin import this_commit, this_machine
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
 from training.triples import last_step_of, order_of
@@ -277,5 +278,7 @@ def write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
         "python": platform.python_version(),
         "torch": torch.__version__,
         "machine": f"{platform.machine()} {platform.system()}",
+        "hardware": this_machine(),
+        "git_commit": this_commit(),
     }
     write_atomically(run / "provenance.json", json.dumps(provenance, indent=1).encode())

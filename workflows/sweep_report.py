@@ -15,7 +15,7 @@ from training.sweep_figures import PMD_UNIT, RunCurve, run_curve, sweep_figure
 from training.tables import markdown
 from workflows.trials import Sweep, Trial, varied_values
 
-FILES = ("sweep.md", "sweep.csv", "figures/sweep.png", "best.yaml")
+FILES = ("report.html", "report.md", "sweep.md", "sweep.csv", "figures/sweep.png", "best.yaml")
 _STATES = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "stopped", "RUNNING": "unfinished"}
 _LEVEL = re.compile(r"(\d+(?:\.\d+)?)(x?)")
 _DEFINITION = """\

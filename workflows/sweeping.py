@@ -13,6 +13,7 @@ from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.ranks import TrainingStopped
 from training.record import read_record, update_record
+from training.report import report_of_sweep
 from training.sweep_figures import PMD_UNIT
 from training.triples import last_step_of
 from workflows.cluster import ray_cluster
@@ -141,6 +142,7 @@ def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None
 def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     """Write the report, and give the parent record what a person wants to see first: table, figure, best trial."""
     results = _write_report(sweep, out, settings)
+    report_of_sweep(out)
     record, best = read_record(out), best_of(results)
     assert record is not None
     metrics = {f"trials_{state}": float(sum(r.state == state for r in results)) for state in ("finished", "failed")}
