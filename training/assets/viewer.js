@@ -1,108 +1,17 @@
 // Source of viewer.bundle.js, which training/viewer.py writes into every page. To rebuild (three 0.187.0, esbuild 0.28.2):
 //   cd training/assets && npm install && npm run build && rm -rf node_modules package-lock.json
 // One WebGL context draws all panels, each through its own scissor rectangle: browsers allow only a few contexts a page.
-import {
-  BufferAttribute, BufferGeometry, Color, DataTexture, DirectionalLight, DoubleSide, HemisphereLight, LinearFilter, Mesh,
-  MeshBasicMaterial, MeshStandardMaterial, PerspectiveCamera, PlaneGeometry, RGBAFormat, Scene, SRGBColorSpace, Vector3,
-  WebGLRenderer,
-} from "three";
+import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { data, find } from "./viewer.data.js";
+import { bytes, clear, decode, errorColors, ground, roleColors, shaded, surface } from "./viewer.meshes.js";
+import { build, fit, make } from "./viewer.tiles.js";
 
-const data = JSON.parse(document.getElementById("data").textContent);
-const find = (id) => document.getElementById(id);
-const faceCache = new Map();
-const errors = data.examples.some((example) => Object.keys(example.errors).length);
-const stacked = errors && data.methods.length > 1; // an error below each output
 let renderer;
 let panels = [];
 let current = 0;
 let pending = false;
 let touched = false; // until the reader turns something, a change of size sets the view anew
-
-function bytes(base64) {
-  return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
-}
-
-// Little-endian whatever the machine, as written.
-function decode(base64, kind) {
-  const raw = bytes(base64);
-  const view = new DataView(raw.buffer);
-  const [Kind, size, read] = {
-    uint8: [Uint8Array, 1, "getUint8"],
-    uint16: [Uint16Array, 2, "getUint16"],
-    uint32: [Uint32Array, 4, "getUint32"],
-    float32: [Float32Array, 4, "getFloat32"],
-  }[kind];
-  return Kind.from({ length: raw.length / size }, (_, index) => view[read](index * size, true));
-}
-
-function positions(mesh) {
-  return Float32Array.from(decode(mesh.positions, "uint16"), (level, index) => mesh.low[index % 3] + level * mesh.step[index % 3]);
-}
-
-function faces(key) {
-  if (!faceCache.has(key)) faceCache.set(key, new BufferAttribute(decode(data.faces[key].indices, data.faces[key].kind), 1));
-  return faceCache.get(key);
-}
-
-function roleColors(color, count) {
-  const linear = new Color().setRGB(...color, SRGBColorSpace);
-  return Float32Array.from({ length: 3 * count }, (_, index) => [linear.r, linear.g, linear.b][index % 3]);
-}
-
-function errorColors(errors) {
-  const map = data.error.colors.map((color) => new Color().setRGB(...color.map((level) => level / 255), SRGBColorSpace));
-  const result = new Float32Array(3 * errors.length);
-  errors.forEach((error, index) => {
-    const level = Math.min(Math.round((255 * error) / data.error.limit), 255);
-    map[level].toArray(result, 3 * index);
-  });
-  return result;
-}
-
-function shaded(colors, openness, strength) {
-  return colors.map((value, index) => value * (1 - strength * (1 - openness[Math.floor(index / 3)] / 255)));
-}
-
-function surface(mesh, colors) {
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(positions(mesh), 3));
-  geometry.setAttribute("color", new BufferAttribute(colors, 3));
-  geometry.setIndex(faces(mesh.faces).clone());
-  geometry.computeVertexNormals();
-  const material = new MeshStandardMaterial({
-    vertexColors: true, side: DoubleSide, roughness: 0.62, metalness: 0, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
-  });
-  const body = new Mesh(geometry, material);
-  const wires = new MeshBasicMaterial({ color: 0x10151d, wireframe: true, transparent: true, opacity: 0.38 });
-  const wire = new Mesh(geometry, wires);
-  wire.name = "wireframe";
-  wire.visible = find("wireframe").checked;
-  body.add(wire);
-  return body;
-}
-
-function ground(mesh) {
-  const darkness = bytes(mesh.ground.shadow);
-  const side = Math.round(Math.sqrt(darkness.length));
-  const pixels = new Uint8Array(4 * darkness.length);
-  darkness.forEach((level, index) => { pixels[4 * index + 3] = 0.7 * level; });
-  const texture = new DataTexture(pixels, side, side, RGBAFormat);
-  texture.magFilter = texture.minFilter = LinearFilter;
-  texture.needsUpdate = true;
-  const plane = new PlaneGeometry(mesh.ground.side, mesh.ground.side).rotateX(Math.PI / 2); // rows of the texture along +Z
-  const shadow = new Mesh(plane, new MeshBasicMaterial({ map: texture, transparent: true, depthWrite: false, side: DoubleSide }));
-  shadow.position.set(mesh.ground.corner[0] + mesh.ground.side / 2, mesh.low[1], mesh.ground.corner[1] + mesh.ground.side / 2);
-  shadow.renderOrder = -1;
-  return shadow;
-}
-
-function clear(scene) {
-  for (const child of [...scene.children].filter((one) => one.isMesh)) {
-    scene.remove(child);
-    child.traverse((one) => { one.geometry.dispose(); one.material.map?.dispose(); one.material.dispose(); });
-  }
-}
 
 // What a panel shows of an example: mesh, colours, words below; nothing where a method or the truth is missing.
 function content(panel, example) {
@@ -197,78 +106,6 @@ function follow(leader) {
     panel.camera.position.copy(leader.camera.position);
     panel.camera.quaternion.copy(leader.camera.quaternion);
   }
-}
-
-function make(tag, name, words = "") {
-  const element = document.createElement(tag);
-  element.className = name;
-  element.textContent = words;
-  return element;
-}
-
-// Tiles from left to right, each with its panels from top to bottom.
-function tiles() {
-  const one = (kind, method = "") => ({ kind, method });
-  const outputs = data.methods.map(({ name }) => (stacked ? [one("output", name), one("error", name)] : [one("output", name)]));
-  const truth = data.examples.some((example) => example.truth) ? [[one("truth")]] : [];
-  if (stacked) return [[one("source"), one("target")], ...outputs, ...truth];
-  return [[one("source")], [one("target")], ...outputs, ...truth, ...(errors ? [[one("error", data.methods[0].name)]] : [])];
-}
-
-const WORDS = { source: ["Source", "pose"], target: ["Target", "identity"], truth: ["Ground truth", ""], error: ["Error", ""] };
-
-function heading({ kind, method }) {
-  const [words, small] = WORDS[kind] ?? [data.methods.length > 1 ? method : "Output", ""];
-  const title = make("h2", "", words);
-  const dot = make("i", "dot");
-  dot.style.background = data.methods.find(({ name }) => name === method)?.color;
-  if (kind === "output" && data.methods.length > 1) title.prepend(dot);
-  title.append(make("small", "", small), make("small", "tag", "least error"));
-  return title;
-}
-
-function build() {
-  for (const specs of tiles()) {
-    const tile = make("div", "tile");
-    for (const spec of specs) {
-      const element = make("section", "panel");
-      element.append(heading(spec), make("p", "name"));
-      tile.append(element);
-      panels.push({ ...spec, element, tile });
-    }
-    if (stacked && specs[0].kind === "truth") tile.append(find("numbers"));
-    find("grid").append(tile);
-  }
-  find("numbers").hidden = !errors;
-  for (const { name, color } of data.methods.length > 1 ? data.methods : []) find("methods").append(chip(name, color));
-}
-
-function chip(name, color) {
-  const label = make("label", "chip");
-  const box = document.createElement("input");
-  Object.assign(box, { type: "checkbox", checked: true });
-  box.style.accentColor = color;
-  box.addEventListener("change", () => {
-    for (const panel of panels.filter(({ method }) => method === name)) panel.tile.hidden = !box.checked;
-    resize();
-  });
-  label.append(box, name);
-  return label;
-}
-
-// As many tiles abreast as have room, lines of equal length, and panels as high as the window allows.
-function fit() {
-  const grid = find("grid");
-  const shown = [...grid.querySelectorAll(".tile:not([hidden])")].length;
-  const gap = 8;
-  const abreast = Math.max(Math.floor((grid.clientWidth + gap) / (168 + gap)), 1);
-  const lines = Math.ceil(shown / abreast);
-  const columns = Math.ceil(shown / lines);
-  const width = (grid.clientWidth - gap * (columns - 1)) / columns;
-  const room = window.innerHeight - grid.getBoundingClientRect().top - window.scrollY - document.querySelector("footer").offsetHeight;
-  const height = lines === 1 ? Math.min(stacked ? (room - gap) / 2 : room, 1.6 * width) : 1.1 * width;
-  grid.style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
-  grid.style.setProperty("--panel-height", `${Math.round(Math.max(height, 200))}px`);
 }
 
 function addPanel(panel) {
@@ -373,7 +210,7 @@ function fill() {
 
 function start() {
   fill();
-  build();
+  panels = build(resize);
   try {
     renderer = new WebGLRenderer({ antialias: true, alpha: true });
     renderer.autoClear = false;
