@@ -1,4 +1,7 @@
-"""Meshes: normalisation, edges, and the one place where mesh files are read and written."""
+"""Meshes: normalisation, edges, and files of vertices and faces alone, as data sets have them.
+
+A person's own files, with all that is in them, are read and written by :mod:`datagen.mesh_files`.
+"""
 
 import io
 import os

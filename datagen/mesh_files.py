@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import BodyError, MeshError, StorageError
-from datagen.mesh import FORMATS, Mesh, check_mesh, write_atomically
+from datagen.mesh import Mesh, check_mesh, write_atomically
 from datagen.mesh_glb_built import built_draft, built_glb
 from datagen.mesh_glb_written import Draft
-from datagen.mesh_limits import refuse_huge
+from datagen.mesh_limits import refuse_huge, require_file, require_known, require_thickness
 from datagen.mesh_obj import ObjContent
 from datagen.mesh_obj_built import built_obj
 from datagen.mesh_plain import OffContent, StlContent, built_off, built_stl
@@ -35,8 +35,10 @@ _TEXTS: dict[str, Callable[[bytes, Path], Content]] = {
     ".off": OffContent,
     ".stl": StlContent,
 }
-_FLAT = 1e-6  # of the longest edge of the bounding box
-_DAMAGE = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, struct.error, np.linalg.LinAlgError)
+_DAMAGE = (
+    LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
+    np.linalg.LinAlgError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile
         faces without vertices, no extent, no thickness, too many vertices, several geometries.
     """
     path = Path(path)
-    _require_file(path)
+    require_file(path)
     try:
         refuse_huge(path)
         content = _content(path, geometry)
@@ -90,27 +92,12 @@ def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
     mesh = check_mesh(Mesh(vertices, faces), name=str(path))
-    _require_thickness(vertices, path)
+    require_thickness(vertices, path)
     return MeshFile(path, content.name or path.stem, mesh, component_count(vertices, faces), content)
 
 
 def _one_line(reason: object) -> str:
     return " ".join(str(reason).split())[:300]
-
-
-def _require_file(path: Path) -> None:
-    if path.is_dir():
-        raise MeshError(f"{path} is a folder; name a mesh file in it")
-    if not path.is_file():
-        raise MeshError(f"no mesh file at {path}")
-    _require_known(path)
-    if path.stat().st_size == 0:
-        raise MeshError(f"{path} is empty (0 bytes): export or copy it again")
-
-
-def _require_known(path: Path) -> None:
-    if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
 
 
 def _content(path: Path, geometry: str | None) -> Content:
@@ -123,7 +110,8 @@ def _content(path: Path, geometry: str | None) -> Content:
 
 
 def _glb_content(path: Path, geometry: str | None) -> Content:
-    from datagen.mesh_gltf import GlbContent, GlbFile, solid_nodes  # brings SciPy, which takes longer than reading
+    from datagen.mesh_glb_scene import GlbFile, solid_nodes  # brings SciPy, which takes longer to import than to read
+    from datagen.mesh_gltf import GlbContent
 
     with path.open("rb") as file:
         if file.read(4) != b"glTF":
@@ -154,17 +142,6 @@ def _faces(content: Content, path: Path) -> NDArray[np.int64]:
     return surface.faces
 
 
-def _require_thickness(vertices: NDArray[np.float64], path: Path) -> None:
-    """A flat mesh has no pose, and its normalised box would hide that."""
-    extent = np.ptp(vertices, axis=0)
-    flat = ["xyz"[axis] for axis in range(3) if extent[axis] <= _FLAT * extent.max()]
-    if flat:
-        raise MeshError(f"{path} is flat: it has no thickness along {' and '.join(flat)}; pose transfer needs a body")
-    centred = (vertices - vertices.mean(axis=0)) / extent.max()
-    if np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred / len(centred))[0], 0)) <= _FLAT:
-        raise MeshError(f"{path} is flat: all vertices lie in one slanted plane; pose transfer needs a body")
-
-
 def posed_bytes(original: MeshFile, vertices: NDArray[np.floating], suffix: str) -> bytes:
     """The original with other vertices [n, 3], as a file of the format of ``suffix``, without files beside it.
 
@@ -177,7 +154,7 @@ def posed_bytes(original: MeshFile, vertices: NDArray[np.floating], suffix: str)
 
 
 def _encoded(original: MeshFile, vertices: NDArray[np.floating], suffix: str, stem: str | None) -> Encoded:
-    _require_known(Path(f"mesh{suffix}"))
+    require_known(Path(f"mesh{suffix}"))
     positions = usable(original, vertices)
     if suffix == original.path.suffix.lower():
         return original.content.rewritten(positions)
@@ -272,7 +249,7 @@ def check_writable(out: Path) -> None:
     out = Path(out)
     if out.is_dir():
         raise MeshError(f"{out} is a folder; name the file to write, for example {out / 'posed.obj'}")
-    _require_known(out)
+    require_known(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

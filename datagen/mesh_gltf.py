@@ -10,30 +10,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count, takewhile
-from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.gltf import Gltf
+from datagen.mesh_glb_scene import SOLID, GlbFile, base_texture, image_bytes, read_material, solid_nodes
 from datagen.mesh_glb_written import Block, Draft, GlbParts, Json
-from datagen.mesh_surface import Encoded, Image, Material, Surface, numbered, srgb
+from datagen.mesh_surface import Encoded, Image, Surface, numbered, srgb
 from datagen.skins import triangles
 
-_SOLID = (4, 5, 6)  # triangles, strips, fans
 _KEPT_ON_PRIMITIVES = ("KHR_materials_variants",)
 _DERIVED = ("POSITION", "NORMAL", "TANGENT", "JOINTS_", "WEIGHTS_")
-
-
-class GlbFile(Gltf):
-    """A glTF file whose buffer views can be had as bytes."""
-
-    def view(self, number: int) -> bytes:
-        """The bytes of a buffer view."""
-        return self._elements(
-            number, 0, np.dtype(np.uint8), self.json["bufferViews"][number]["byteLength"], 1
-        ).tobytes()
 
 
 @dataclass(frozen=True)
@@ -44,18 +31,6 @@ class Piece:
     json: Json
     start: int
     corners: NDArray[np.int64]
-
-
-def solid_nodes(file: Gltf) -> dict[str, int]:
-    """Nodes with a mesh of triangles, by name; names that come again get a number."""
-    found: dict[str, int] = {}
-    for number, node in enumerate(file.nodes):
-        if "mesh" in node:
-            mesh = file.json["meshes"][node["mesh"]]
-            if any(each.get("mode", 4) in _SOLID for each in mesh["primitives"]):
-                name = str(node.get("name") or mesh.get("name") or f"mesh {node['mesh']}")
-                found[f"{name} #{number}" if name in found else name] = number
-    return found
 
 
 class GlbContent:
@@ -71,13 +46,14 @@ class GlbContent:
         self._starts = self._accessor_starts()
         self._pieces = list(self._read_pieces())
         self.vertices = np.concatenate([self._positions(piece) for piece in self._firsts])
+        self.draft()  # what cannot be read is to be known now, not when all is computed
 
     def _accessor_starts(self) -> dict[int, int]:
         """Where the vertices of each accessor of positions begin in the mesh; primitives may share one."""
         starts, total = dict[int, int](), 0
         for primitive in self._mesh["primitives"]:
             accessor = primitive.get("attributes", {}).get("POSITION")
-            if primitive.get("mode", 4) in _SOLID and accessor not in starts and accessor is not None:
+            if primitive.get("mode", 4) in SOLID and accessor not in starts and accessor is not None:
                 starts[accessor] = total
                 total += self._file.json["accessors"][accessor]["count"]
         return starts
@@ -85,7 +61,7 @@ class GlbContent:
     def _read_pieces(self) -> Iterator[Piece]:
         for number, primitive in enumerate(self._mesh["primitives"]):
             mode, accessor = primitive.get("mode", 4), primitive.get("attributes", {}).get("POSITION")
-            if mode in _SOLID and accessor is not None:
+            if mode in SOLID and accessor is not None:
                 size = self._file.json["accessors"][accessor]["count"]
                 corners = np.arange(size)
                 if "indices" in primitive:
@@ -146,7 +122,7 @@ class GlbContent:
             shading=self._group[corners] if self._group is not None else None,
             colours=self._colours(),
             material_of=np.repeat(of_piece, lengths) if used else None,
-            materials=tuple(self._material(number) for number in used),
+            materials=tuple(read_material(self._file, number) for number in used),
         )
 
     @cached_property
@@ -163,7 +139,7 @@ class GlbContent:
             return None
         found = []
         for piece in self._pieces:
-            name = f"TEXCOORD_{self._base(piece.json.get('material', -1)).get('texCoord', 0)}"
+            name = f"TEXCOORD_{base_texture(self._file, piece.json.get('material', -1)).get('texCoord', 0)}"
             there = piece.json["attributes"].get(name)
             rows = self._file.accessor(there)[piece.corners] if there is not None else np.zeros((len(piece.corners), 2))
             found.append(rows.astype(np.float64))
@@ -175,36 +151,6 @@ class GlbContent:
         found = [self._file.accessor(piece.json["attributes"]["COLOR_0"]) for piece in self._firsts]
         opaque = [np.concatenate([each, np.ones((len(each), 4 - each.shape[1]))], axis=1) for each in found]
         return srgb(np.concatenate(opaque))
-
-    def _base(self, number: int) -> Json:
-        """How a material names the texture of its base colour."""
-        materials = self._file.json.get("materials", [])
-        if not 0 <= number < len(materials):
-            return {}
-        return materials[number].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-
-    def _material(self, number: int) -> Material:
-        material = self._file.json["materials"][number]
-        red, green, blue, alpha = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1, 1, 1, 1))
-        texture = self._base(number).get("index")
-        image = None
-        if texture is not None and "source" in self._file.json["textures"][texture]:
-            image = self._image(self._file.json["textures"][texture]["source"])
-        return Material(str(material.get("name") or f"material_{number}"), (red, green, blue, alpha), image)
-
-    def _image(self, number: int) -> Image | None:
-        image = self._file.json["images"][number]
-        content = self._image_bytes(image)
-        return Image(str(image.get("name") or f"image_{number}"), content) if content is not None else None
-
-    def _image_bytes(self, image: Json) -> bytes | None:
-        """The bytes of an image inside the file, or beside it; None where they are nowhere."""
-        if "bufferView" in image:
-            return self._file.view(image["bufferView"])
-        uri = str(image.get("uri", ""))
-        beside = self._file.path.parent / unquote(uri)
-        inside = not uri.startswith("data:") and ".." not in Path(unquote(uri)).parts
-        return beside.read_bytes() if uri and inside and beside.is_file() else None
 
     @property
     def only_here(self) -> list[str]:
@@ -277,7 +223,7 @@ class GlbContent:
         return kept | mesh | ({"extensions": extensions} if extensions else {})
 
     def _copied_image(self, image: Json, parts: GlbParts) -> Json:
-        content = self._image_bytes(image)
+        content = image_bytes(self._file, image)
         if content is None:
             return dict(image)
         kept = {k: v for k, v in image.items() if k not in ("uri", "bufferView")}

@@ -188,6 +188,18 @@ def test_scenes_that_cannot_be_posed(tmp_path: Path, change: dict[str, Any], mes
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("uri", "kept"), [("skin.png", True), ("../secret.png", False), ("{}/secret.png", False)])
+def test_a_texture_beside_goes_into_the_file_but_none_from_elsewhere(tmp_path: Path, uri: str, kept: bool) -> None:
+    document = scene()
+    document.json["images"] = [{"uri": uri.format(tmp_path)}]
+    (tmp_path / "secret.png").write_bytes(PNG + b"elsewhere")
+    read = read_mesh_file(saved(document, tmp_path / "mine"))
+    (tmp_path / "mine" / "skin.png").write_bytes(PNG + b"beside")
+    write_posed(read, read.mesh.vertices, tmp_path / "out.glb")
+    content = (tmp_path / "out.glb").read_bytes()
+    assert (PNG + b"beside" in content) == kept and b"elsewhere" not in content
+
+
 def test_points_alone_are_no_mesh(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="no faces"):
         read_mesh_file(saved(scene(mode=0), tmp_path))
