@@ -68,7 +68,7 @@ def sphere(vertices: int, *, seed: int) -> Mesh:
 
 def inside(transfer: PoseTransfer, source: Mesh, target: Mesh) -> dict[str, float]:
     """Seconds of one pair with everything loaded."""
-    probe = np.repeat(source.vertices[None, :512], 24, axis=0)
+    probe = np.repeat(source.vertices[None, :256], 24, axis=0)
     return {
         "one pair": median(lambda: transfer(source=source, target=target)),
         "one pair, refined": median(lambda: transfer(source=source, target=target, refine=DEFAULT_WEIGHT)),

@@ -21,8 +21,8 @@ SelfErrors = Callable[[Floats], NDArray[np.float64]]
 """Meshes [b, n, 3] in the normalised box -> PMD [b] of each when it is transferred onto itself."""
 
 NAMES = ("X", "Y", "Z", "-X", "-Y", "-Z")
-_PROBED_VERTICES = 512  # of a mesh: the errors of so many tell the 24 ways apart as well as those of all
-_CLEARLY = 1.3  # a way of standing must come back so many times better than the training data's to be believed
+_PROBED_VERTICES = 256  # of a mesh: so many tell the 24 ways apart as well as 512 do (docs/transfer.md)
+CLEARLY = 1.3  # a way of standing must come back so many times better than the training data's to be believed
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Orientation:
     @property
     def is_unlike_training(self) -> bool:
         """Whether the mesh comes back clearly better when it is turned."""
-        return bool(self.errors[0] > _CLEARLY * self.errors.min())
+        return bool(self.errors[0] > CLEARLY * self.errors.min())
 
     def error(self, axes: Axes) -> float:
         """PMD of the mesh transferred onto itself when it stands by ``axes``."""
@@ -119,7 +119,7 @@ def orientation(self_errors: SelfErrors, meshes: Sequence[Floats]) -> Orientatio
     self_errors
         :meth:`training.transfer.PoseTransfer.self_errors` of the network.
     meshes
-        Vertices [n, 3] in any unit; 512 of them, evenly spread over their order, are looked at.
+        Vertices [n, 3] in any unit; 256 of them, evenly spread over their order, are looked at.
     """
     return Orientation(np.mean([self_errors(_turned_ways(mesh)) for mesh in meshes], axis=0))
 

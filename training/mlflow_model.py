@@ -9,7 +9,8 @@ The signature takes arrays; with ``model.unwrap_python_model()`` meshes may be n
 ... # doctest: +SKIP
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,8 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
         There is no such model there, it is none of this project's, or the server cannot be reached.
     """
     try:
-        found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder), tracking_uri=tracking_uri))
+        with _server(tracking_uri):
+            found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder)))
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise RegistryError(f"{uri} cannot be had from MLflow at {tracking_uri}: {reason}") from error
@@ -93,6 +95,19 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
     if not weights.is_dir():
         raise RegistryError(f"{uri} at {tracking_uri} holds no weights of dsffnet; name a model that a training made")
     return weights
+
+
+@contextmanager
+def _server(uri: str) -> Iterator[None]:
+    """Ask this server and its registry in the block; a ``tracking_uri`` argument would leave the registry as it is."""
+    before = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    mlflow.set_tracking_uri(uri)
+    mlflow.set_registry_uri(uri)
+    try:
+        yield
+    finally:
+        mlflow.set_tracking_uri(before[0])
+        mlflow.set_registry_uri(before[1])
 
 
 mlflow.models.set_model(PoseTransferModel())

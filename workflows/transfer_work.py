@@ -51,9 +51,9 @@ class TransferWork:
         ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
         self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
         chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
-        meshes = {str(self.job.sources[0]): self.first, str(self.job.target): self.target.mesh}
-        for (name, mesh), axes, way in zip(meshes.items(), self.axes, ways, strict=True):
-            for line in remarks(mesh, name=name, axes=axes, way=way, chosen=chosen, seen=seen):
+        meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
+        for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
+            for line in remarks(mesh, name=str(path), axes=axes, way=way, chosen=chosen, seen=seen):
                 warn(line)
 
     def run(self) -> str:

@@ -181,3 +181,8 @@ def test_a_transfer_needs_neither_ray_nor_mlflow_nor_pandas(run: Path, tmp_path:
     done = command("transfer", *words, PYTHONPATH=f"{tmp_path}:{Path(cli.__file__).parents[1]}")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "x.obj").is_file()
+
+
+def test_one_file_may_be_source_and_target(transfer: Transfer, tmp_path: Path) -> None:
+    transfer("pose.obj", "pose.obj", "-o", tmp_path / "x.obj")
+    assert files(tmp_path) == ["x.obj"]
