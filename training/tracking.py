@@ -329,12 +329,14 @@ def _experiment(client: Any, server: Server) -> str:
 def _signature() -> Any:
     import numpy as np
     from mlflow.models import ModelSignature
-    from mlflow.types import Schema, TensorSpec
+    from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
 
     real, whole = np.dtype(np.float64), np.dtype(np.int64)
     names = {"source": real, "target": real, "target_faces": whole}
     inputs = Schema([TensorSpec(kind, (-1, 3), name) for name, kind in names.items()])
-    return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]))
+    options = {"up": ("string", "Y"), "front": ("string", "Z"), "align": ("boolean", False), "refine": ("double", 0.0)}
+    params = ParamSchema([ParamSpec(name, *kind_and_default) for name, kind_and_default in options.items()])
+    return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]), params=params)
 
 
 class Mirror:

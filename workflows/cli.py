@@ -1,185 +1,46 @@
 """The ``dsffnet`` command: one subcommand for each thing that a person does with datasets, runs and meshes."""
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from pathlib import Path
+import importlib
+import sys
+from collections.abc import Sequence
 
-from datagen.errors import DatasetError
-from workflows.commands import Command, add_command
-from workflows.comparison_command import ablation_command, add_comparison_options, compare_command
-from workflows.comparison_plan import Kind
-from workflows.console import add_recipe_options, add_tracking_option, guarded, server_of, server_of_record
-from workflows.data_commands import add_data_commands
-from workflows.evaluated import which_checkpoint
-from workflows.generalisation_command import EXAMPLES as GENERALISATION_EXAMPLES
-from workflows.generalisation_command import add_generalisation_options, generalisation_command
-from workflows.recipe import load_recipe
-from workflows.robustness_command import EXAMPLES as ROBUSTNESS_EXAMPLES
-from workflows.robustness_command import add_robustness_options, robustness_command
-from workflows.sweep_command import add_sweep_options, sweep_command
-from workflows.transfer_command import add_transfer
+from workflows.console import guarded
+
+_GROUPS = {
+    ("generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in"): (
+        "workflows.data_commands",
+        "add_data_commands",
+    ),
+    ("train", "evaluate", "sync", "recipe"): ("workflows.run_commands", "add_run_commands"),
+    ("sweep", "compare", "ablation", "robustness", "generalisation"): (
+        "workflows.study_commands",
+        "add_study_commands",
+    ),
+    ("transfer",): ("workflows.transfer_command", "add_transfer"),
+}
+"""Subcommands that are declared together -> module and function that declare them."""
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    options = _parser().parse_args()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser(words).parse_args(words)
     guarded(lambda: options.command(options))
 
 
-def train_command(options: argparse.Namespace) -> None:
-    """Train on a dataset into a run folder, or go on with a training."""
-    from datagen.store import open_dataset
-    from workflows.cluster import ray_cluster, require_reachable
-    from workflows.console import alone_in, remove_run
-    from workflows.pipeline import check_run_accepts, train_stage
-
-    recipe = load_recipe(options.recipe, options.set).training
-    run = Path(require_reachable(options.out, option="--out"))
-    data = require_reachable(options.data, option="--data", urls=True)
-    check_run_accepts(recipe, open_dataset(data), run if not options.fresh else run / "none")
-    if options.fresh:
-        with alone_in(run, ".driver.lock"):
-            remove_run(run)
-    with _mirrored(run, options), ray_cluster() if recipe.launcher == "ray" else nullcontext():
-        train_stage(recipe, data, run, parent=None)
-    print(f"trained: {options.out}. Next: dsffnet evaluate {options.out} --data {options.data}")
-
-
-def evaluate_command(options: argparse.Namespace) -> None:
-    """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run."""
-    from datagen.store import open_dataset
-    from training.record import read_record
-    from workflows.cluster import ray_cluster, require_reachable
-    from workflows.evaluated import evaluated
-    from workflows.pipeline import evaluate_stage
-
-    recipe = load_recipe(options.recipe, options.set).evaluation
-    place = Path(require_reachable(options.run, option="RUN"))
-    home, data = evaluated(place, options.checkpoint).home, require_reachable(options.data, option="--data", urls=True)
-    open_dataset(data)
-    with _mirrored(home, options), ray_cluster():
-        parent = home if read_record(home) else None
-        print(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
-
-
-def sync_command(options: argparse.Namespace) -> None:
-    """Send to MLflow what an outage kept back; repeating it changes nothing."""
-    from training.record import find_records
-    from training.tracking import publish
-    from workflows.console import server_of_record
-
-    run = Path(options.run)
-    records = find_records(run) if run.is_dir() else []
-    if not records:
-        raise DatasetError(f"{run} holds no record of a run. Name the folder that a workflow or training wrote to")
-    server = server_of_record(records[0], options.tracking_uri)
-    publish(run.resolve(), server)
-    print(f"{server.uri} is up to date with {run} ({len(records)} runs)")
-
-
-def recipe_command(options: argparse.Namespace) -> None:
-    """Print a resolved recipe as YAML."""
-    import yaml
-
-    recipe = load_recipe(options.recipe, options.set)
-    print(yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False), end="")
-
-
-_EXAMPLES: dict[Command, str] = {
-    train_command: """\
-  dsffnet train --recipe quickstart --data data/quickstart.zarr --out runs/first
-  dsffnet train --recipe quickstart --set training.steps=8000 --data data/quickstart.zarr --out runs/longer""",
-    evaluate_command: """\
-  dsffnet evaluate runs/first --data data/quickstart.zarr
-  dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
-  dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
-    sweep_command: "  dsffnet sweep --trials networks --out runs/networks",
-    compare_command: """\
-  dsffnet compare --out runs/compare
-  dsffnet compare --recipe animals-small --set training.steps=500""",
-    ablation_command: "  dsffnet ablation --out runs/ablation",
-    sync_command: """\
-  dsffnet sync runs/quickstart/run
-  dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000""",
-    recipe_command: """\
-  dsffnet recipe --recipe quickstart
-  dsffnet recipe --recipe mine.yaml --set training.batch=16
-  dsffnet recipe --set training=npt-paper training.steps=100""",
-}
-
-
-_COMPARED: dict[Command, Kind] = {compare_command: "comparison", ablation_command: "ablation"}
-
-
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """A parser of the subcommand that is asked for and its like, as importing all takes seconds; else of all."""
     made = argparse.ArgumentParser(
         prog="dsffnet",
         description="3-D pose transfer: datasets, training, evaluation, and posing your own meshes.",
         epilog="From nothing to a trained and evaluated model in one go: python workflows/full.py",
     )
     commands = made.add_subparsers(required=True, metavar="COMMAND")
-
-    add_data_commands(commands)
-
-    train = add_command(commands, train_command, _EXAMPLES[train_command], takes_recipe=True)
-    add_recipe_options(train)
-    train.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset")
-    train.add_argument("--out", required=True, metavar="RUN", help="run folder; an existing one is gone on with")
-    train.add_argument("--fresh", action="store_true", help="remove the run first")
-    add_tracking_option(train)
-
-    evaluate = add_command(commands, evaluate_command, _EXAMPLES[evaluate_command], takes_recipe=True)
-    evaluate.add_argument("run", metavar="RUN", help="run folder of a training, a workflow's, a checkpoint or weights")
-    _add_checkpoint(evaluate)
-    evaluate.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset")
-    add_recipe_options(evaluate)
-    add_tracking_option(evaluate)
-
-    add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
-    for compared, kind in _COMPARED.items():
-        add_comparison_options(add_command(commands, compared, _EXAMPLES[compared], takes_recipe=True), kind)
-    add_robustness_options(add_command(commands, robustness_command, ROBUSTNESS_EXAMPLES))
-    add_generalisation_options(add_command(commands, generalisation_command, GENERALISATION_EXAMPLES))
-
-    add_transfer(commands)
-
-    sync = add_command(commands, sync_command, _EXAMPLES[sync_command])
-    sync.add_argument("run", metavar="RUN", help="run folder, or the folder of a whole workflow")
-    add_tracking_option(sync)
-
-    add_recipe_options(add_command(commands, recipe_command, _EXAMPLES[recipe_command], takes_recipe=True))
+    asked = {names: place for names, place in _GROUPS.items() if set(words[:1]) & set(names)}
+    for module, function in (asked or _GROUPS).values():
+        getattr(importlib.import_module(module), function)(commands)
     return made
-
-
-def _add_checkpoint(made: argparse.ArgumentParser) -> None:
-    made.add_argument(
-        "--checkpoint",
-        type=which_checkpoint,
-        default="result",
-        metavar="result|latest|best|STEP",
-        help="which of the run's weights (result: the best where early stopping ended the run, else the latest)",
-    )
-
-
-@contextmanager
-def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
-    """Keep MLflow up to date with a run folder while the block runs; an outage is an error only at the end."""
-    from training.record import find_records, read_record
-    from training.tracking import Mirror
-
-    recorded = [folder for folder in find_records(run) if read_record(folder)]
-    server = (
-        server_of_record(recorded[0], options.tracking_uri) if recorded else server_of(run.parent, options.tracking_uri)
-    )
-    mirror = Mirror(run, server)
-    mirror.start()
-    try:
-        yield
-    finally:
-        outage = mirror.close()
-    if outage:
-        raise outage
 
 
 if __name__ == "__main__":

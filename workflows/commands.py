@@ -3,8 +3,6 @@
 import argparse
 from collections.abc import Callable
 
-from workflows.recipe import describe_fields
-
 Command = Callable[[argparse.Namespace], None]
 
 
@@ -16,7 +14,7 @@ def add_command(
     takes_recipe: bool = False,
 ) -> argparse.ArgumentParser:
     """A subparser named after ``NAME_command`` and described by its docstring; with a recipe, all keys are listed."""
-    keys = "\n\nkeys for --set, with their defaults:\n" + "\n".join(describe_fields()) if takes_recipe else ""
+    keys = f"\n\n{_keys()}" if takes_recipe else ""
     made = commands.add_parser(
         command.__name__.removesuffix("_command").replace("_", "-"),
         help=(command.__doc__ or "").split("\n")[0],
@@ -26,6 +24,12 @@ def add_command(
     )
     made.set_defaults(command=command)
     return made
+
+
+def _keys() -> str:
+    from workflows.recipe import describe_fields
+
+    return "\n".join(["keys for --set, with their defaults:", *describe_fields()])
 
 
 def print_facts(facts: dict[str, str]) -> None:

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from datagen.errors import DsffnetError, RecipeError
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
 from workflows.cluster import require_reachable
-from workflows.recipe import describe_fields, known_recipes
+from workflows.named_recipes import known_recipes
 
 log = logging.getLogger(__name__)
 _OWN = (
@@ -85,6 +85,8 @@ def workflow_parser(text: str) -> argparse.ArgumentParser:
 
 def parser(text: str) -> argparse.ArgumentParser:
     """A parser whose help is ``text`` as written and, at its end, every key of a recipe."""
+    from workflows.recipe import describe_fields  # it brings all body models
+
     keys = "\n".join(describe_fields())
     return argparse.ArgumentParser(
         description=text,

@@ -74,7 +74,7 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
     (tmp_path / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
     (tmp_path / "junk.glb").write_bytes(b"junk")
-    (tmp_path / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 4 2\n")
 
     def transfer(source: str, model: Path = run, out: str = "out.obj") -> subprocess.CompletedProcess[str]:
         target = tmp_path / "good.obj"
@@ -84,7 +84,7 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
 
     fails(transfer("none.obj"), 1, "no mesh file at", "none.obj")
     fails(transfer("nan.obj"), 1, "nan.obj", "1 vertices are not finite")
-    fails(transfer("points.obj"), 1, "points.obj", "no triangles")
+    fails(transfer("points.obj"), 1, "points.obj holds 3 vertices and no faces")
     fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as a GLB mesh")
     fails(transfer("good.obj", model=tmp_path / "norun"), 1, "norun has no usable checkpoint")
     fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")

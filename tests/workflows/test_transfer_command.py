@@ -43,7 +43,7 @@ def transfer(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tran
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(*words: object) -> None:
-        options = cli._parser().parse_args(["transfer", *map(str, words), "--model", str(run)])
+        options = cli._parser(["transfer"]).parse_args(["transfer", *map(str, words), "--model", str(run)])
         options.command(options)
 
     return call
@@ -157,7 +157,7 @@ def test_models_and_servers_that_are_not_there(run: Path, tmp_path: Path, monkey
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(model: str) -> None:
-        options = cli._parser().parse_args(
+        options = cli._parser(["transfer"]).parse_args(
             ["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model]
         )
         options.command(options)
