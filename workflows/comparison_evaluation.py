@@ -76,4 +76,5 @@ def _draw(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], rows
     draw_comparisons(examples, folder, title=plan.title)
     convergence_figure(runs, folder / "figures" / "convergence.png")
     if plan.kind == "ablation":
-        ablation_figure(rows, folder / "figures" / "ablation.png")
+        trained = [row for name in plan.methods for row in rows if row.method == name]
+        ablation_figure(trained, folder / "figures" / "ablation.png")
