@@ -1,5 +1,6 @@
 """Comparisons from start to end, on legs: trained, measured on the same triples, shown; then nothing is left to do."""
 
+import os
 import re
 import subprocess
 import sys
@@ -39,7 +40,8 @@ def run(script: str, out: Path, methods: str) -> str:
     recipe = out.parent / f"{script}.yaml"
     recipe.write_text(LEGS + methods)
     command = [sys.executable, f"workflows/{script}.py", "--recipe", str(recipe), "--out", str(out)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=400, check=False)
+    own = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
+    done = subprocess.run(command, cwd=ROOT, env=own, capture_output=True, text=True, timeout=400, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
