@@ -1,4 +1,4 @@
-"""Weights that the authors released: DSFFNet's and NPT's, in their state_dict layout and in ours.
+"""Weights that the authors released, in their state_dict layout and in ours: DSFFNet's, NPT's and 3D-CoreNet's.
 
 The released modules are convolutions of kernel 1 (weights ``[c, i, 1]``), ours are linear layers (``[c, i]``). Names
 correspond part by part, see the two tables. Instance norms have neither weights nor statistics.
@@ -15,8 +15,17 @@ import torch
 from torch import Tensor, nn
 
 from training.checkpoint import CheckpointError
+from training.networks.corenet3d_released import load_released_corenet3d
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
+
+__all__ = [
+    "load_released_corenet3d",
+    "load_released_dsffnet",
+    "load_released_npt",
+    "to_released_dsffnet",
+    "to_released_npt",
+]
 
 Network = TypeVar("Network", bound=nn.Module)
 Released = str | Path | Mapping[str, Any]
