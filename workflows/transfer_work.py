@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from datagen.errors import StorageError
 from datagen.mesh import Mesh
-from datagen.mesh_files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh_files import MeshFile, write_posed
 from datagen.mesh_glb_written import FRAME_LIMIT
 from datagen.mesh_sequences import write_animation
 from training.alignment import UPRIGHT, Axes, orientation
@@ -59,7 +59,7 @@ class TransferWork:
     def run(self) -> str:
         """Write everything; what was done, in a line."""
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
-        if self.job.picture or self.job.viewer:
+        if self.job.drawn:
             self._draw()
         return done
 
@@ -69,7 +69,7 @@ class TransferWork:
         return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
 
     def _source(self, number: int) -> Mesh:
-        return self.first if number == 0 else read_mesh_file(self.job.sources[number]).mesh
+        return self.first if number == 0 else self.job.read_source(number).mesh
 
     def _write_pair(self) -> str:
         job, posed = self.job, next(self._posed())
