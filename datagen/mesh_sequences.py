@@ -15,7 +15,7 @@ INTERPOLATIONS = ("LINEAR", "STEP")
 
 
 def frames_of(path: str | Path) -> list[Path]:
-    """The mesh files of a folder, of a pattern (``run/*.obj``, ``run/%04d.obj``, ``run/##.obj``), or of a file's series.
+    """The mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
 
     The series of a numbered file are the files beside it that differ from it in that number alone.
 

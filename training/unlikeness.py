@@ -1,7 +1,8 @@
 """Where a mesh is unlike what a network was trained on, in words that say what to do.
 
-What the network saw is noted in the run when training begins. For runs that noted nothing it is asked of the dataset
-that the run names, while it is still where it was; weights that were sent elsewhere are judged by what holds for any.
+What the network saw is noted in the run when training begins, and goes into the registry with its weights. For runs
+that noted nothing it is asked of the dataset that they name, while it is still where it was; other weights are judged
+by what holds for any.
 """
 
 import json
@@ -67,11 +68,12 @@ def seen_by(weights: Path) -> Seen | None:
 
 
 def _provenance(weights: Path) -> dict[str, Any]:
-    for folder in weights.absolute().parents:
+    start = weights.absolute()
+    for folder in (start, *start.parents):
         about = folder / "provenance.json"
         if about.is_file():
             return dict(json.loads(about.read_text()))
-        if folder.name != "checkpoints" and not folder.name.startswith("step-"):
+        if folder not in (start, start.parent) and folder.name != "checkpoints":
             break
     raise KeyError("provenance")
 
