@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from datagen.errors import DatasetError, StorageError
 from datagen.mesh import Mesh, bounding_box, edges_of
-from training.alignment import Axes, Orientation
+from training.alignment import Axes, Orientation, axes_as_options
 
 if TYPE_CHECKING:
     from datagen.store import Dataset
@@ -99,7 +99,9 @@ def _spread(count: int, wanted: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, wanted).astype(np.int64))
 
 
-def remarks(mesh: Mesh, *, name: str, axes: Axes, way: Orientation, chosen: bool, seen: Seen | None) -> Iterator[str]:
+def remarks(
+    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], chosen: bool, seen: Seen | None
+) -> Iterator[str]:
     """One line for everything about a mesh that its network has not met.
 
     Parameters
@@ -108,25 +110,23 @@ def remarks(mesh: Mesh, *, name: str, axes: Axes, way: Orientation, chosen: bool
         As it is in its file.
     name
         What the lines call it.
-    axes, way, chosen
-        How it is taken to stand, how well it comes back in every way of standing, and whether a person said so.
+    axes, way, both, chosen
+        How it is taken to stand, how well it comes back in every way of standing, how source and target seem to stand,
+        and whether a person said how.
     seen
         What the network saw, None where that is not known.
     """
     upright = axes.turned(mesh.vertices)
-    yield from _about_standing(name, axes, way, chosen=chosen)
+    stands_otherwise = not chosen and way.is_unlike_training and way.axes != axes
+    yield from _about_standing(name, axes, way, axes_as_options(*both) if stands_otherwise else None)
     yield from _about_parts(name, mesh)
-    yield from _about_box(name, upright, seen)
+    yield from _about_box(name, upright, None if stands_otherwise else seen)
     yield from _about_count(name, len(upright), seen)
 
 
-def _about_standing(name: str, axes: Axes, way: Orientation, *, chosen: bool) -> Iterator[str]:
-    if not chosen and way.is_unlike_training and way.axes != axes:
-        found = way.axes
-        yield (
-            f"{name} seems to stand {found}, the training data {axes}: add --align, or --up={found.up} "
-            f"--front={found.front} for that mesh"
-        )
+def _about_standing(name: str, axes: Axes, way: Orientation, mended_by: str | None) -> Iterator[str]:
+    if mended_by is not None:
+        yield f"{name} seems to stand {way.axes}, the training data {axes}: add --align, or {mended_by}"
     elif way.error(axes) > _POOR_ERROR:
         yield (
             f"{name} comes back from the network as another shape (PMD {way.error(axes):.3f} onto itself): it is "

@@ -53,7 +53,8 @@ class TransferWork:
         chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
         for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
-            for line in remarks(mesh, name=str(path), axes=axes, way=way, chosen=chosen, seen=seen):
+            both = ways[0].axes, ways[1].axes
+            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, chosen=chosen, seen=seen):
                 warn(line)
 
     def run(self) -> str:

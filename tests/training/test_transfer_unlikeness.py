@@ -30,7 +30,8 @@ def told(
     chosen: bool = False,
     seen: Seen | None = SEEN,
 ) -> str:
-    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, chosen=chosen, seen=seen))
+    both = UPRIGHT, way.axes
+    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, both=both, chosen=chosen, seen=seen))
 
 
 @pytest.mark.parametrize("seen", [SEEN, None])
@@ -43,7 +44,10 @@ def test_a_mesh_that_stands_otherwise_is_told_how_to_be_turned() -> None:
     lying = EVERY_AXES.index(Axes("Z", "-Y"))
     errors[lying] = 0.001
     found = told(BODY, way=Orientation(errors))
-    assert "A seems to stand Z up, facing -Y" in found and "--align, or --up=Z --front=-Y" in found
+    assert "A seems to stand Z up, facing -Y" in found and found.endswith("--align, or --up=Y,Z --front=Z,-Y")
+    assert "box" not in told(Mesh(GRID * (4, 1, 1), STRIP), way=Orientation(errors)), (
+        "its box is not that of the turned"
+    )
     assert told(BODY, way=Orientation(errors), axes=Axes("Z", "-Y"), chosen=True, seen=None) == ""
 
 
