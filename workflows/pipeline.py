@@ -276,7 +276,7 @@ def write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
     write_atomically(run / "recipe.yaml", yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
     provenance = {
         "dataset": about_dataset(dataset),
-        "seen": noted(seen_in(dataset)),
+        "seen": noted(seen_in(dataset)) if len(dataset.identities("training")) else None,  # that is refused later
         "data_provenance": dataset.attributes["provenance"],
         "python": platform.python_version(),
         "torch": torch.__version__,

@@ -81,6 +81,11 @@ class TransferJob:
         return self.out.with_name(f"{self.out.stem if self.is_file else self.out.name}{suffix}")
 
     @property
+    def outputs(self) -> list[Path]:
+        """The file that is written, or the animation and the files of the frames."""
+        return [self.out] if self.is_file else [self.animation, *map(self.frame_file, self.sources)]
+
+    @property
     def drawn(self) -> list[Path]:
         """The picture and the page that are asked for."""
         wanted = {".png": self.picture, ".html": self.viewer}
@@ -109,7 +114,7 @@ class TransferJob:
             A place cannot be written.
         """
         read = {path.resolve() for path in (*self.sources, self.target)}
-        outputs = [self.out] if self.is_file else [self.animation, *map(self.frame_file, self.sources)]
+        outputs = self.outputs
         folder = next((path for path in self.drawn if path.is_dir()), None)
         if folder is not None:
             raise MeshError(f"{folder} is a folder, where --picture or --viewer would write; choose another --out")

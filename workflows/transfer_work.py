@@ -83,7 +83,7 @@ class TransferWork:
         if job.is_file:
             self._animate(self._posed(), job.animation)
             return about
-        with _appearing_whole(job.out) as folder:
+        with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
             if len(job.sources) > FRAME_LIMIT:
                 warn(f"no {job.animation.name}: it holds {FRAME_LIMIT:,} frames at most, and these are more")
                 deque(self._saved(folder), maxlen=0)
@@ -149,15 +149,26 @@ def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
 
 
+def _move(path: Path, place: Path, *, is_own: bool) -> None:
+    if not is_own and place.exists() and place.read_bytes() != path.read_bytes():
+        warn(f"{place.name}: another file of that name is in {place.parent} and was left as it is")
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(path, place)
+
+
 @contextmanager
-def _appearing_whole(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` to write into, whose files move there only if the block succeeds."""
+def _appearing_whole(out: Path, *, own: set[str]) -> Iterator[Path]:
+    """A folder beside ``out`` to write into, whose files move there only if the block succeeds.
+
+    Those of ``own`` take the place of an earlier run's; materials and textures leave other files of their name alone.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             yield Path(folder)
-            out.mkdir(exist_ok=True)
-            for path in sorted(Path(folder).iterdir()):
-                os.replace(path, out / path.name)
+            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                name = path.relative_to(folder)
+                _move(path, out / name, is_own=str(name) in own)
     except OSError as error:
         raise StorageError(f"could not write {out}: {error.strerror or error}") from error

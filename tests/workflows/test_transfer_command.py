@@ -135,6 +135,24 @@ def test_a_folder_becomes_a_folder_named_after_the_frames_and_one_animation(
     assert "12 frames of person.obj" in said.out and "transfer" in said.err and "12/12" in said.err
 
 
+def test_frames_take_the_place_of_earlier_ones_but_not_of_other_files(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skins, out = tmp_path / "skins", tmp_path / "out"
+    (skins / "textures").mkdir(parents=True)
+    (skins / "person.mtl").write_text("newmtl skin\nmap_Kd textures/skin.png\n")
+    (skins / "textures" / "skin.png").write_bytes(b"a texture")
+    (skins / "person.obj").write_text("mtllib person.mtl\n" + Path("person.obj").read_text())
+    out.mkdir()
+    (out / "person.mtl").write_text("of another body")
+    for _ in range(2):
+        (out / "frame_1.obj").write_text("of an earlier run")
+        transfer("walk", skins / "person.obj", "-o", out)
+        assert (out / "person.mtl").read_text() == "of another body"
+        assert "person.mtl: another file of that name" in capsys.readouterr().err
+        assert load_mesh(out / "frame_1.obj") and (out / "textures" / "skin.png").read_bytes() == b"a texture"
+
+
 def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path) -> None:
     transfer("walk/frame_*.ply", "person.obj", "-o", tmp_path / "walked.glb")
     assert files(tmp_path) == ["walked.glb"]
