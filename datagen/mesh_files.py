@@ -10,6 +10,7 @@ all objects of an OBJ file are one mesh, as they share its vertices; glTF with c
 """
 
 import os
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from datagen.mesh_glb_built import built_draft, built_glb
 from datagen.mesh_glb_written import Draft
 from datagen.mesh_limits import refuse_huge, require_file, require_known, require_thickness
 from datagen.mesh_obj import ObjContent
-from datagen.mesh_obj_built import built_obj
+from datagen.mesh_obj_built import built_obj, one_word
 from datagen.mesh_plain import OffContent, StlContent, built_off, built_stl
 from datagen.mesh_ply import PlyContent, built
 from datagen.mesh_surface import Content, Encoded, component_count
@@ -68,7 +69,7 @@ class MeshFile:
 def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile:
     """Read a mesh file (OBJ, PLY, GLB, OFF or STL) with all that is needed to write it again.
 
-    ``geometry`` names the one to take of a GLB scene that holds several.
+    ``geometry`` names the one to take of a GLB scene that holds several; other formats are one mesh as a whole.
 
     Raises
     ------
@@ -104,8 +105,10 @@ def _content(path: Path, geometry: str | None) -> Content:
     if path.suffix.lower() == ".glb":
         return _glb_content(path, geometry)
     content = _TEXTS[path.suffix.lower()](path.read_bytes(), path)
-    if geometry not in (None, content.name, path.stem):
-        raise MeshError(f"{path} holds one geometry, {content.name or path.stem!r}, and none called {geometry!r}")
+    if geometry is not None:
+        raise MeshError(
+            f"{path} is one mesh as a whole; only a GLB has geometries to choose: save {geometry!r} by itself"
+        )
     return content
 
 
@@ -124,7 +127,8 @@ def _glb_content(path: Path, geometry: str | None) -> Content:
     if geometry is not None and geometry not in nodes:
         raise MeshError(f"{path} has no geometry {geometry!r}; it has {names}")
     if geometry is None and len(nodes) > 1:
-        raise MeshError(f"{path} holds {len(nodes)} geometries: {names}. Choose one with --geometry NAME")
+        how = "--source-geometry NAME or --target-geometry NAME"
+        raise MeshError(f"{path} holds {len(nodes)} geometries: {names}. Choose one with {how}")
     name = geometry or next(iter(nodes))
     return GlbContent(scene, name, nodes[name])
 
@@ -221,7 +225,8 @@ def _write_beside(out: Path, name: str, content: bytes) -> list[str]:
     place = out.parent / name
     if place.is_file() and place.read_bytes() == content:
         return []
-    if place.exists() and not place.name.startswith(out.stem):
+    called_after = re.fullmatch(rf"({re.escape(out.stem)}|{re.escape(one_word(out.stem))})(-\d+)?\.\w+", name)
+    if place.exists() and not called_after:
         return [f"{name}: another file of that name is in {out.parent} and was left as it is"]
     write_atomically(place, content)
     return []

@@ -18,7 +18,7 @@ def built_obj(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
     materials = _told_apart(surface.materials) if stem else ()
     images = _images(materials, stem) if stem else {}
     lines = [f"mtllib {stem}.mtl"] if materials else []
-    lines += [f"o {_one_word(name)}", *_vertex_lines(vertices, surface.colours)]
+    lines += [f"o {one_word(name)}", *_vertex_lines(vertices, surface.colours)]
     columns: list[NDArray[np.int64] | None] = [surface.corners, None, None]
     if surface.uvs is not None:
         columns[1], rows = _distinct(surface.uvs)
@@ -34,7 +34,8 @@ def built_obj(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
     return Encoded("\n".join([*lines, ""]).encode(), beside, [] if stem or not surface.materials else ["materials"])
 
 
-def _one_word(name: str) -> str:
+def one_word(name: str) -> str:
+    """A name as OBJ and MTL files can hold it: without spaces, and not empty."""
     return re.sub(r"\s+", "_", name.strip()) or "mesh"
 
 
@@ -42,7 +43,7 @@ def _told_apart(materials: tuple[Material, ...]) -> tuple[Material, ...]:
     """The materials under names without spaces that differ from each other."""
     found: dict[str, Material] = {}
     for number, material in enumerate(materials):
-        name = _one_word(material.name)
+        name = one_word(material.name)
         found[f"{name}_{number}" if name in found else name] = material
     return tuple(Material(name, material.colour, material.image) for name, material in found.items())
 
@@ -54,7 +55,7 @@ def _images(materials: tuple[Material, ...], stem: str) -> dict[str, tuple[str, 
     for material in materials:
         if material.image:
             suffix = _SUFFIXES.get(material.image.mime or "", Path(material.image.name).suffix)
-            file = name_of.setdefault(material.image.content, f"{_one_word(stem)}-{len(name_of)}{suffix}")
+            file = name_of.setdefault(material.image.content, f"{one_word(stem)}-{len(name_of)}{suffix}")
             found[material.name] = (file, material.image)
     return found
 

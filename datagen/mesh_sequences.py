@@ -15,7 +15,9 @@ INTERPOLATIONS = ("LINEAR", "STEP")
 
 
 def frames_of(path: str | Path) -> list[Path]:
-    """The mesh files of a folder, of a pattern (``run/*.obj``), or of the series that a numbered file is of.
+    """The mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
+
+    The series of a numbered file are the files beside it that differ from it in that number alone.
 
     In natural order: 2 before 10. A folder or pattern with mesh files of several formats is refused, for they would
     take turns. A file without a number is a series of one.
@@ -30,8 +32,9 @@ def frames_of(path: str | Path) -> list[Path]:
         found = [each for each in path.iterdir() if _is_mesh(each)]
     elif path.is_file():
         found = _series(path)
-    elif any(sign in path.name for sign in "*?["):
-        found = [each for each in path.parent.glob(path.name) if _is_mesh(each)] if path.parent.is_dir() else []
+    elif is_pattern(path):
+        name = _NUMBER.sub("[0-9]*", path.name)
+        found = [each for each in path.parent.glob(name) if _is_mesh(each)] if path.parent.is_dir() else []
     else:
         raise MeshError(f"no mesh file or folder at {path}")
     if not found:
@@ -40,6 +43,14 @@ def frames_of(path: str | Path) -> list[Path]:
     if len(kinds) > 1:
         raise MeshError(f"{path} holds meshes of several formats; choose one with a pattern, such as '*{kinds[0]}'")
     return sorted(found, key=_natural)
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path stands for several files; one that is there under this very name does not."""
+    return not path.exists() and (any(sign in path.name for sign in "*?[") or bool(_NUMBER.search(path.name)))
+
+
+_NUMBER = re.compile(r"%\d*d|#+")
 
 
 def _is_mesh(path: Path) -> bool:

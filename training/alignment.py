@@ -89,6 +89,13 @@ def axes_of_both(up: str, front: str) -> tuple[Axes, Axes]:
     return Axes(ups[0], fronts[0]), Axes(ups[-1], fronts[-1])
 
 
+def axes_as_options(source: Axes, target: Axes) -> str:
+    """What :func:`axes_of_both` reads, as it is typed."""
+    ups, fronts = ((source.up, target.up), (source.front, target.front))
+    alike = source == target
+    return f"--up={ups[0] if alike else ','.join(ups)} --front={fronts[0] if alike else ','.join(fronts)}"
+
+
 @dataclass(frozen=True)
 class Orientation:
     """How well a mesh comes back from the network in each of EVERY_AXES: PMD [24] in the normalised box."""

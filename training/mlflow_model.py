@@ -9,6 +9,7 @@ The signature takes arrays; with ``model.unwrap_python_model()`` meshes may be n
 ... # doctest: +SKIP
 """
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,10 +19,14 @@ import mlflow
 import numpy as np
 from mlflow.pyfunc import PythonModel
 
-from datagen.errors import DsffnetError
-from datagen.mesh import Mesh, check_mesh, load_mesh
+from datagen.errors import DsffnetError, MeshError, RecipeError
+from datagen.mesh import Mesh, check_mesh
+from datagen.mesh_files import read_mesh_file
 from training.alignment import Axes, axes_of_both, orientation
 from training.transfer import PoseTransfer
+
+_BAR = "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR"
+_DEFAULTS: dict[str, Any] = {"up": "Y", "front": "Z", "align": False, "refine": 0.0}
 
 
 class RegistryError(DsffnetError):
@@ -41,7 +46,10 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         self._transfer = PoseTransfer.from_run(context.artifacts["weights"])
 
     def predict(self, context: Any, model_input, params=None):  # type: ignore[no-untyped-def]  # MLflow reads hints
-        wanted = {"up": "Y", "front": "Z", "align": False, "refine": 0.0, **(params or {})}
+        unknown = sorted(set(params or {}) - set(_DEFAULTS))
+        if unknown:
+            raise RecipeError(f"{unknown[0]!r} is no option of a transfer; there are {', '.join(_DEFAULTS)}")
+        wanted = {**_DEFAULTS, **(params or {})}
         target = _mesh(model_input, "target")
         source = _source(model_input)
         of_source, of_target = self._axes(source, target, wanted)
@@ -64,7 +72,9 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
 def _mesh(model_input: Any, role: str) -> Mesh:
     given = model_input[role]
     if isinstance(given, str | Path):
-        return load_mesh(given)
+        return read_mesh_file(given).mesh
+    if f"{role}_faces" not in model_input:
+        raise MeshError(f"{role}_faces is missing: triangles [f, 3] go with the vertices of {role}")
     mesh = Mesh(np.asarray(given, np.float64), np.asarray(model_input[f"{role}_faces"], np.int64))
     return check_mesh(mesh, name=role)
 
@@ -73,7 +83,7 @@ def _source(model_input: Any) -> Mesh:
     """The source; of a pose no faces are asked, so that one that points nowhere wrong stands for them."""
     given = model_input["source"]
     if isinstance(given, str | Path):
-        return load_mesh(given)
+        return read_mesh_file(given).mesh
     return check_mesh(Mesh(np.asarray(given, np.float64), np.zeros((1, 3), np.int64)), name="source")
 
 
@@ -85,6 +95,9 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
     RegistryError
         There is no such model there, it is none of this project's, or the server cannot be reached.
     """
+    store = Path(tracking_uri.removeprefix("sqlite:///"))
+    if tracking_uri.startswith("sqlite:///") and not store.is_file():  # MLflow would make one, of an empty registry
+        raise RegistryError(f"{uri} cannot be had: there is no MLflow store {store}; check --tracking-uri")
     try:
         with _server(tracking_uri):
             found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder)))
@@ -99,15 +112,23 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
 
 @contextmanager
 def _server(uri: str) -> Iterator[None]:
-    """Ask this server and its registry in the block; a ``tracking_uri`` argument would leave the registry as it is."""
-    before = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    """Ask this server and its registry in the block.
+
+    The arguments of ``download_artifacts`` do not do it: of ``models:/`` the registry is asked that the process has.
+    Where the process has named none, none is named afterwards, lest its registry stay behind when it changes servers.
+    """
+    tracking, registry = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    named = {name: os.environ.get(name) for name in (_BAR, "MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")}
+    os.environ[_BAR] = "false"  # of a hundred small files
     mlflow.set_tracking_uri(uri)
     mlflow.set_registry_uri(uri)
     try:
         yield
     finally:
-        mlflow.set_tracking_uri(before[0])
-        mlflow.set_registry_uri(before[1])
+        mlflow.set_tracking_uri(tracking)
+        mlflow.set_registry_uri("" if registry == tracking else registry)
+        for name, value in named.items():  # MLflow sets them for processes that it starts
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
 
 
 mlflow.models.set_model(PoseTransferModel())

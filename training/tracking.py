@@ -16,7 +16,7 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -261,6 +261,8 @@ class _Publication:
         packages = [Path(__file__).parent, Path(__file__).parents[1] / "datagen"]
         with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
             export_weights(checkpoint, Path(temporary) / "weights")
+            with suppress(FileNotFoundError):  # what bodies it learned from, for training.unlikeness
+                shutil.copy(self.folder / "provenance.json", Path(temporary) / "weights")
             code = [str(shutil.copytree(p, Path(temporary) / p.name, ignore=_NO_CACHES)) for p in packages]
             model = mlflow.pyfunc.log_model(
                 name="model",

@@ -26,8 +26,10 @@ class PoseTransfer:
     """A trained network with the normalisation around it.
 
     >>> transfer = PoseTransfer.from_run("runs/quickstart/run")        # doctest: +SKIP
-    >>> posed = transfer(source=load_mesh("pose.obj"), target=load_mesh("person.obj"))    # doctest: +SKIP
-    >>> for frame in transfer.sequence(walk, person, smooth=7): ...    # doctest: +SKIP
+    >>> source, target = read_mesh_file("pose.obj"), read_mesh_file("person.obj")    # doctest: +SKIP
+    >>> posed = transfer(source=source.mesh, target=target.mesh)    # doctest: +SKIP
+    >>> write_posed(target, posed.vertices, Path("posed.obj"))      # doctest: +SKIP
+    >>> for frame in transfer.sequence(walk, target.mesh, smooth=7): ...    # doctest: +SKIP
     """
 
     def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Sequence
 
@@ -21,12 +22,25 @@ _GROUPS = {
 }
 """Subcommands that are declared together -> module and function that declare them."""
 
+_AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = with_axes_joined(sys.argv[1:] if arguments is None else arguments)
     options = _parser(words).parse_args(words)
     guarded(lambda: options.command(options))
+
+
+def with_axes_joined(words: Sequence[str]) -> list[str]:
+    """``--front -Y`` as ``--front=-Y``: argparse takes every word that begins with a minus for an option."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] in ("--up", "--front") and _AXES.fullmatch(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

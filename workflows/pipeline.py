@@ -267,13 +267,16 @@ def _vertex_counts(dataset: Dataset) -> tuple[int, int]:
 
 
 def write_run_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
-    """recipe.yaml (what is trained) and provenance.json (with what, on what), before the work starts."""
+    """recipe.yaml (what is trained) and provenance.json (with what, on what bodies), before the work starts."""
     import torch
     import yaml
+
+    from training.unlikeness import noted, seen_in
 
     write_atomically(run / "recipe.yaml", yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
     provenance = {
         "dataset": about_dataset(dataset),
+        "seen": noted(seen_in(dataset)) if len(dataset.identities("training")) else None,  # that is refused later
         "data_provenance": dataset.attributes["provenance"],
         "python": platform.python_version(),
         "torch": torch.__version__,

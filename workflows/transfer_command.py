@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,14 +16,12 @@ _EXAMPLES = """\
   dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
   dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
   dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine"""
-_AXIS = re.compile(r"-[XYZxyz](,-?[XYZxyz])?$|-\d+$|-\d*\.\d+$")
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
 
 def add_transfer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Declare the command and its options."""
     made = add_command(commands, transfer_command, _EXAMPLES)
-    made._negative_number_matcher = _AXIS  # else argparse takes the -Y of ``--front -Y`` for an option
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
     made.add_argument(
         "--model", required=True, metavar="RUN", help="run folder, weights, or models:/NAME@ALIAS (MLflow)"
@@ -41,6 +38,8 @@ def add_transfer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     made.add_argument("--target", metavar="B", help="mesh of the wanted identity")
     made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
+    made.add_argument("--source-geometry", metavar="NAME", help="which of several geometries of a GLB has the pose")
+    made.add_argument("--target-geometry", metavar="NAME", help="which of several geometries of a GLB is posed")
     _add_standing(made)
     _add_extras(made)
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
@@ -64,17 +63,17 @@ def _add_extras(made: argparse.ArgumentParser) -> None:
 
 def transfer_command(options: argparse.Namespace) -> None:
     """Pose one mesh like another, or like each of a sequence."""
-    from datagen.mesh_files import read_mesh_file
     from workflows.transfer_job import TransferJob
 
     job = TransferJob.from_options(options)
     job.check_places()
-    first, target = read_mesh_file(job.sources[0]).mesh, read_mesh_file(job.target)
+    source, target = job.read_source(0), job.read_target()
+    job.check_textures(source, target)
     with weights_of(options) as weights:
         from training.transfer import PoseTransfer
         from workflows.transfer_work import TransferWork
 
-        work = TransferWork(job, PoseTransfer.from_run(weights), first=first, target=target)
+        work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
         work.settle_axes(weights)
         print(work.run())
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from datagen.errors import StorageError
 from datagen.mesh import Mesh
-from datagen.mesh_files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh_files import MeshFile, write_posed
 from datagen.mesh_glb_written import FRAME_LIMIT
 from datagen.mesh_sequences import write_animation
 from training.alignment import UPRIGHT, Axes, orientation
@@ -53,13 +53,14 @@ class TransferWork:
         chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
         for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
-            for line in remarks(mesh, name=str(path), axes=axes, way=way, chosen=chosen, seen=seen):
+            both = ways[0].axes, ways[1].axes
+            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, chosen=chosen, seen=seen):
                 warn(line)
 
     def run(self) -> str:
         """Write everything; what was done, in a line."""
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
-        if self.job.picture or self.job.viewer:
+        if self.job.drawn:
             self._draw()
         return done
 
@@ -69,7 +70,7 @@ class TransferWork:
         return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
 
     def _source(self, number: int) -> Mesh:
-        return self.first if number == 0 else read_mesh_file(self.job.sources[number]).mesh
+        return self.first if number == 0 else self.job.read_source(number).mesh
 
     def _write_pair(self) -> str:
         job, posed = self.job, next(self._posed())
@@ -82,7 +83,7 @@ class TransferWork:
         if job.is_file:
             self._animate(self._posed(), job.animation)
             return about
-        with _appearing_whole(job.out) as folder:
+        with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
             if len(job.sources) > FRAME_LIMIT:
                 warn(f"no {job.animation.name}: it holds {FRAME_LIMIT:,} frames at most, and these are more")
                 deque(self._saved(folder), maxlen=0)
@@ -148,15 +149,26 @@ def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
 
 
+def _move(path: Path, place: Path, *, is_own: bool) -> None:
+    if not is_own and place.exists() and place.read_bytes() != path.read_bytes():
+        warn(f"{place.name}: another file of that name is in {place.parent} and was left as it is")
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(path, place)
+
+
 @contextmanager
-def _appearing_whole(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` to write into, whose files move there only if the block succeeds."""
+def _appearing_whole(out: Path, *, own: set[str]) -> Iterator[Path]:
+    """A folder beside ``out`` to write into, whose files move there only if the block succeeds.
+
+    Those of ``own`` take the place of an earlier run's; materials and textures leave other files of their name alone.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             yield Path(folder)
-            out.mkdir(exist_ok=True)
-            for path in sorted(Path(folder).iterdir()):
-                os.replace(path, out / path.name)
+            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                name = path.relative_to(folder)
+                _move(path, out / name, is_own=str(name) in own)
     except OSError as error:
         raise StorageError(f"could not write {out}: {error.strerror or error}") from error

@@ -159,7 +159,7 @@ def test_skin_animation_and_morphs_are_applied_at_rest_then_dropped_and_named(tm
 def test_a_scene_of_several_geometries_is_refused_until_one_is_chosen(tmp_path: Path) -> None:
     both = trimesh.Scene({"body": trimesh.creation.icosphere(1), "hat": trimesh.creation.box()})
     both.export(tmp_path / "both.glb")
-    with pytest.raises(MeshError, match=r"holds 2 geometries: 'body', 'hat'. Choose one with --geometry NAME"):
+    with pytest.raises(MeshError, match=r"holds 2 geometries: 'body', 'hat'. Choose one with --source-geometry"):
         read_mesh_file(tmp_path / "both.glb")
     with pytest.raises(MeshError, match="no geometry 'shoe'; it has 'body', 'hat'"):
         read_mesh_file(tmp_path / "both.glb", geometry="shoe")

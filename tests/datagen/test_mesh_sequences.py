@@ -17,7 +17,7 @@ from datagen.errors import MeshError, StorageError
 from datagen.gltf import Gltf
 from datagen.mesh import Mesh, save_mesh
 from datagen.mesh_files import MeshFile, read_mesh_file
-from datagen.mesh_sequences import frames_of, write_animation
+from datagen.mesh_sequences import frames_of, is_pattern, write_animation
 from tests.datagen.test_mesh_gltf import saved, scene, sound
 from tests.datagen.test_mesh_obj_files import PNG, cube
 
@@ -186,3 +186,12 @@ def test_the_header_counts_what_streams_behind_it(tmp_path: Path) -> None:
     last = described["bufferViews"][-1]
     assert last["byteStride"] == 12 and last["byteOffset"] + last["byteLength"] == described["buffers"][0]["byteLength"]
     assert last["byteLength"] == 39 * 24 * 24
+
+
+@pytest.mark.parametrize("name", ["walk_*.off", "walk_%d.off", "walk_%02d.off", "walk_##.off", "walk_[12]*.off"])
+def test_patterns_of_frames(tmp_path: Path, name: str) -> None:
+    for number in (1, 2, 10):
+        (tmp_path / f"walk_{number}.off").write_text("OFF")
+    (tmp_path / "body#1.off").write_text("OFF")
+    assert is_pattern(tmp_path / name) and not is_pattern(tmp_path / "body#1.off")
+    assert [path.name for path in frames_of(tmp_path / name)] == ["walk_1.off", "walk_2.off", "walk_10.off"]

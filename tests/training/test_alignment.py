@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from datagen.errors import RecipeError
-from training.alignment import EVERY_AXES, UPRIGHT, Axes, axes_of_both, orientation
+from training.alignment import EVERY_AXES, UPRIGHT, Axes, axes_as_options, axes_of_both, orientation
 
 BODY = np.random.default_rng(0).normal(size=(60, 3)) * (1, 3, 0.5) + (0, 0, 0.2)
 
@@ -72,3 +72,10 @@ def test_axes_of_one_or_both_meshes_by_hand() -> None:
 def test_axes_that_mean_nothing(up: str, front: str, says: str) -> None:
     with pytest.raises(RecipeError, match=says):
         axes_of_both(up, front)
+
+
+@pytest.mark.parametrize("target", [Axes("Z", "-Y"), Axes("-X", "Y"), UPRIGHT])
+def test_options_are_read_as_they_are_told(target: Axes) -> None:
+    for source in (Axes("Z", "-Y"), UPRIGHT):
+        up, front = (word.partition("=")[2] for word in axes_as_options(source, target).split())
+        assert axes_of_both(up, front) == (source, target)

@@ -11,10 +11,12 @@ import mlflow
 import numpy as np
 import pytest
 
+from datagen.mesh import Mesh
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from training import tracking
 from training.journal import Journal
+from training.mlflow_model import download_weights
 from training.record import (
     ALIAS,
     EXPERIMENT,
@@ -28,6 +30,8 @@ from training.record import (
 )
 from training.tracking import Mirror, TrackingError, publish
 from training.trainer import train
+from training.transfer import PoseTransfer
+from training.unlikeness import seen_by
 
 
 @pytest.fixture(scope="session")
@@ -274,6 +278,8 @@ def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Serv
     """The registered model loads by alias and poses a mesh; the dataset shows as the run's input."""
     run, opened = tmp_path / "run", open_dataset(dataset)
     train(tiny_training(), data=dataset, run=run)
+    note = {"vertices": [7, 9], "proportions": [[0.1] * 3, [1.0] * 3]}
+    (run / "provenance.json").write_text(json.dumps({"seen": note}))
     begin_record(run, name="train", kind="train", parent=None, parameters={})
     about = {"name": "leg.zarr", "uuid": opened.uuid, "manifest_sha256": opened.attributes["manifest_sha256"]}
     update_record(run, model="dsffnet", dataset=about)
@@ -285,6 +291,16 @@ def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Serv
     pair = {"source": source.astype(float), "target": target.astype(float)}
     posed = model.predict(pair | {"target_faces": opened.faces(1).astype(np.int64)})
     assert posed.shape == target.shape and np.isfinite(posed).all()
+    options = {"align": False, "refine": 6.0}
+    refined = model.predict(pair | {"target_faces": opened.faces(1).astype(np.int64)}, params=options)
+    assert abs(refined - posed).max() > 1e-4, "the signature lets options through"
+    weights = download_weights(f"models:/dsffnet@{ALIAS}", server.uri, tmp_path / "fetched")
+    seen = seen_by(weights)
+    assert seen is not None and seen.vertices == (7, 9), "with the weights goes what they were trained on"
+    fetched = PoseTransfer.from_run(weights)(
+        source=Mesh(pair["source"], opened.faces(0)), target=Mesh(pair["target"], opened.faces(1))
+    )
+    assert np.allclose(fetched.vertices, posed, atol=1e-6)
     (given,) = runs_of(server)["train"].inputs.dataset_inputs
     assert given.dataset.digest == about["manifest_sha256"][:36] and given.dataset.name == "leg.zarr"
     _never_registered_twice(run, server)

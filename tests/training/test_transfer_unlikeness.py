@@ -12,7 +12,8 @@ from tests.support.recipes import tiny_dataset, tiny_training
 from training.alignment import EVERY_AXES, UPRIGHT, Axes, Orientation
 from training.checkpoint import require_checkpoint
 from training.trainer import train
-from training.unlikeness import Seen, part_sizes, remarks, seen_by
+from training.unlikeness import Seen, noted, part_sizes, remarks, seen_by
+from workflows.pipeline import write_run_head
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 2, 15), [0.0, 0.4], indexing="ij"), -1).reshape(-1, 3)
 STRIP = np.stack([np.arange(238), np.arange(1, 239), np.arange(2, 240)], axis=1)
@@ -29,7 +30,8 @@ def told(
     chosen: bool = False,
     seen: Seen | None = SEEN,
 ) -> str:
-    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, chosen=chosen, seen=seen))
+    both = UPRIGHT, way.axes
+    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, both=both, chosen=chosen, seen=seen))
 
 
 @pytest.mark.parametrize("seen", [SEEN, None])
@@ -42,7 +44,10 @@ def test_a_mesh_that_stands_otherwise_is_told_how_to_be_turned() -> None:
     lying = EVERY_AXES.index(Axes("Z", "-Y"))
     errors[lying] = 0.001
     found = told(BODY, way=Orientation(errors))
-    assert "A seems to stand Z up, facing -Y" in found and "--align, or --up=Z --front=-Y" in found
+    assert "A seems to stand Z up, facing -Y" in found and found.endswith("--align, or --up=Y,Z --front=Z,-Y")
+    assert "box" not in told(Mesh(GRID * (4, 1, 1), STRIP), way=Orientation(errors)), (
+        "its box is not that of the turned"
+    )
     assert told(BODY, way=Orientation(errors), axes=Axes("Z", "-Y"), chosen=True, seen=None) == ""
 
 
@@ -85,3 +90,26 @@ def test_what_a_run_saw_is_asked_of_its_dataset_while_it_is_there(tmp_path: Path
     assert seen_by(tmp_path / "elsewhere" / "weights.safetensors") is None
     data.rename(tmp_path / "moved.zarr")
     assert seen_by(weights) is None
+
+
+def test_what_a_run_noted_needs_no_dataset(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "run" / "checkpoints" / "step-00000004"
+    checkpoint.mkdir(parents=True)
+    about = {"dataset": {"url": str(tmp_path / "gone.zarr")}, "seen": noted(SEEN)}
+    (tmp_path / "run" / "provenance.json").write_text(json.dumps(about))
+    seen = seen_by(checkpoint)
+    assert seen is not None and seen.vertices == SEEN.vertices
+    assert seen.least.tolist() == list(SEEN.least) and seen.most.tolist() == list(SEEN.most)
+    (tmp_path / "run" / "provenance.json").write_text(json.dumps(about | {"seen": {"vertices": 3}}))
+    assert seen_by(checkpoint) is None, "half a note is none, and no traceback"
+
+
+def test_a_training_notes_its_bodies_such_that_none_of_them_is_warned_of(tmp_path: Path) -> None:
+    dataset = generate(tiny_dataset(), str(tmp_path / "leg.zarr"))
+    write_run_head(tiny_training(), dataset, tmp_path / "run")
+    seen = seen_by(tmp_path / "run" / "checkpoints" / "step-00000001")
+    assert seen is not None and seen.vertices == (32, 32)
+    for who in dataset.identities("training"):
+        for vertices in dataset.vertices(who, dataset.grid.poses_of(who)):
+            shape = np.ptp(vertices, axis=0) / np.ptp(vertices, axis=0).max()
+            assert (seen.least <= shape + 1e-6).all() and (shape <= seen.most + 1e-6).all()

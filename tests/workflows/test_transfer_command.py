@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from datagen.errors import DsffnetError, MeshError, RecipeError, StorageError
 from datagen.generate import generate
@@ -33,6 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for frame in range(12):
         vertices = dataset.vertices(3, frame % 10) + np.float32(0.1 * frame)
         save_mesh(Mesh(vertices, dataset.faces(3)), folder / "walk" / f"frame_{frame}.ply")
+    (folder / "taken.png").mkdir()
     return folder / "run"
 
 
@@ -43,7 +45,8 @@ def transfer(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tran
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(*words: object) -> None:
-        options = cli._parser(["transfer"]).parse_args(["transfer", *map(str, words), "--model", str(run)])
+        typed = cli.with_axes_joined(["transfer", *map(str, words), "--model", str(run)])
+        options = cli._parser(["transfer"]).parse_args(typed)
         options.command(options)
 
     return call
@@ -84,6 +87,43 @@ def test_axes_by_hand_give_the_same_body_lying_as_its_file(transfer: Transfer, r
     assert np.allclose(axes.turned(lying), standing, atol=1e-5)
 
 
+@pytest.mark.parametrize("words", [("--front", "-Y"), ("--front=-Y",), ("--front", "-Y,-Y"), ("--front", "-y")])
+def test_an_axis_with_a_minus_is_no_option(words: tuple[str, ...]) -> None:
+    found = cli._parser(["transfer"]).parse_args(cli.with_axes_joined(["transfer", "--model=r", "--out=o", *words]))
+    assert found.front.upper() in ("-Y", "-Y,-Y")
+    assert cli.with_axes_joined(["a", "--front", "--up", "-Y"]) == ["a", "--front", "--up=-Y"]
+
+
+def test_of_several_geometries_one_is_chosen(transfer: Transfer, tmp_path: Path) -> None:
+    person = load_mesh("person.obj")
+    bodies = {name: trimesh.Trimesh(person.vertices, person.faces, process=False) for name in ("body", "shadow")}
+    trimesh.Scene(bodies).export(tmp_path / "two.glb")
+    with pytest.raises(
+        MeshError, match=r"'body', 'shadow'. Choose one with --source-geometry NAME or --target-geometry"
+    ):
+        transfer("pose.obj", tmp_path / "two.glb", "-o", tmp_path / "x.obj")
+    both = ("--source-geometry", "shadow", "--target-geometry", "body")
+    transfer(tmp_path / "two.glb", tmp_path / "two.glb", "-o", tmp_path / "x.obj", *both)
+    transfer("person.obj", "person.obj", "-o", tmp_path / "y.obj")
+    assert np.allclose(load_mesh(tmp_path / "x.obj").vertices, load_mesh(tmp_path / "y.obj").vertices, atol=1e-4)
+    with pytest.raises(MeshError, match="is one mesh as a whole"):
+        transfer("pose.obj", "person.obj", "-o", tmp_path / "z.obj", "--target-geometry", "hat")
+
+
+@pytest.mark.parametrize("out", ["skins/person.glb", "out/person.obj"])
+def test_a_picture_is_not_written_over_a_texture(transfer: Transfer, tmp_path: Path, out: str) -> None:
+    """In the target's own folder it is the person's file; in another, the copy that the output needs."""
+    (tmp_path / "skins").mkdir()
+    (tmp_path / "skins" / "person.mtl").write_text("newmtl skin\nmap_Kd person.png\n")
+    (tmp_path / "skins" / "person.png").write_bytes(b"a texture")
+    (tmp_path / "skins" / "person.obj").write_text("mtllib person.mtl\n" + Path("person.obj").read_text())
+    with pytest.raises(MeshError, match=r"write over the texture .*person\.png"):
+        transfer("pose.obj", tmp_path / "skins" / "person.obj", "-o", tmp_path / out, "--picture")
+    assert (tmp_path / "skins" / "person.png").read_bytes() == b"a texture"
+    transfer("pose.obj", tmp_path / "skins" / "person.obj", "-o", tmp_path / "out" / "posed.obj", "--picture")
+    assert (tmp_path / "out" / "person.png").read_bytes() == b"a texture"
+
+
 def test_a_folder_becomes_a_folder_named_after_the_frames_and_one_animation(
     transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,6 +133,24 @@ def test_a_folder_becomes_a_folder_named_after_the_frames_and_one_animation(
     assert files(tmp_path / "out") == ["walked", "walked.png", *(f"walked/{n}" for n in ["animation.glb", *frames])]
     said = capsys.readouterr()
     assert "12 frames of person.obj" in said.out and "transfer" in said.err and "12/12" in said.err
+
+
+def test_frames_take_the_place_of_earlier_ones_but_not_of_other_files(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skins, out = tmp_path / "skins", tmp_path / "out"
+    (skins / "textures").mkdir(parents=True)
+    (skins / "person.mtl").write_text("newmtl skin\nmap_Kd textures/skin.png\n")
+    (skins / "textures" / "skin.png").write_bytes(b"a texture")
+    (skins / "person.obj").write_text("mtllib person.mtl\n" + Path("person.obj").read_text())
+    out.mkdir()
+    (out / "person.mtl").write_text("of another body")
+    for _ in range(2):
+        (out / "frame_1.obj").write_text("of an earlier run")
+        transfer("walk", skins / "person.obj", "-o", out)
+        assert (out / "person.mtl").read_text() == "of another body"
+        assert "person.mtl: another file of that name" in capsys.readouterr().err
+        assert load_mesh(out / "frame_1.obj") and (out / "textures" / "skin.png").read_bytes() == b"a texture"
 
 
 def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path) -> None:
@@ -135,6 +193,8 @@ def test_a_broken_frame_leaves_nothing_behind(transfer: Transfer, tmp_path: Path
         (("pose.obj", "person.obj", "-o", "x.obj", "--up", "W"), RecipeError, "'W' is no axis"),
         (("pose.obj", "person.obj", "-o", "x.obj", "--align", "--up", "Z"), RecipeError, "--align finds"),
         (("walk", "person.obj", "-o", "x.glb", "--smooth", "much"), RecipeError, "'much'"),
+        (("pose.obj", "person.obj", "-o", "x.obj", "--smooth", "7"), RecipeError, "pose.obj is one mesh"),
+        (("pose.obj", "person.obj", "-o", "taken.obj", "--picture"), MeshError, "taken.png is a folder"),
     ],
 )
 def test_what_cannot_be_done_is_said_before_the_weights_are_read(
