@@ -35,6 +35,7 @@ __all__ = [
     "evaluation_list",
     "measure_chunk",
     "method_name",
+    "needs_equal_counts",
     "read_rows",
     "require_pairable",
     "triples_in",
@@ -120,6 +121,11 @@ def triples_in(rows: Iterable[Row]) -> int:
     return len({(row.pose_type, row.triple) for row in rows})
 
 
+def needs_equal_counts(network: NetworkRecipe) -> bool:
+    """Whether a network pairs source and target by index, so that both must have as many vertices."""
+    return isinstance(network, NptRecipe) and network.variant == "origin"
+
+
 def require_pairable(name: str, network: NetworkRecipe, source: int, target: int, *, where: str) -> None:
     """Refuse a network that pairs source and target by index for meshes of different counts.
 
@@ -128,7 +134,7 @@ def require_pairable(name: str, network: NetworkRecipe, source: int, target: int
     EvaluationError
         Naming the method, the counts and ``where`` they are.
     """
-    if isinstance(network, NptRecipe) and network.variant == "origin" and source != target:
+    if needs_equal_counts(network) and source != target:
         raise EvaluationError(
             f"{name} pairs source and target vertex by vertex (training.network.variant 'origin'), but {where} has a "
             f"source of {source:,} vertices and a target of {target:,}. Evaluate it on a dataset of one vertex count, "

@@ -12,7 +12,7 @@ from typing import Any
 
 from datagen.mesh import write_atomically
 from training.record import read_record, update_record
-from training.scores import Method, load_methods
+from training.scores import LoadedMethod, load_methods
 from workflows.cluster import require_reachable
 from workflows.evaluated import Evaluated, evaluated, which_checkpoint
 
@@ -46,7 +46,7 @@ def weights_of(options: argparse.Namespace) -> list[Evaluated]:
     return [evaluated(place, options.checkpoint) for place in places]
 
 
-def methods_of(weights: Sequence[Evaluated]) -> list[Method]:
+def methods_of(weights: Sequence[Evaluated]) -> list[LoadedMethod]:
     """Their networks, named after their networks and, where that is not unique, their folders."""
     return load_methods([its.weights for its in weights], labels=[_shown(its) for its in weights])
 
