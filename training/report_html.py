@@ -43,6 +43,9 @@ _BROAD = 900
 _SHORT = 26
 """Letters of a cell up to which a line is not broken."""
 
+_SHORT_NUMBER = 20
+"""Letters up to which a number, with its interval, is not broken."""
+
 _SCRIPT = """\
 const alone = !/^(file|https?):$/.test(location.protocol);
 for (const frame of document.querySelectorAll("iframe[data-src]")) {
@@ -130,9 +133,10 @@ def _table(table: Table) -> str:
 
 
 def _class(table: Table, column: int) -> str:
-    """Numbers stand at the right; short words are not broken into two lines, and long ones have room."""
+    """Numbers stand at the right, a long interval below them; short words are not broken, and long ones have room."""
     if table.numeric[column]:
-        return ' class="number"'
+        broad = any(len(line[column]) > _SHORT_NUMBER for line in table.lines[1:])
+        return ' class="number broad"' if broad else ' class="number"'
     short = all(len(line[column]) <= _SHORT for line in table.lines)
     return ' class="short"' if short else ' class="long"'
 
