@@ -164,7 +164,8 @@ def note_2(inference: Mapping[str, Inference]) -> str:
     return (
         f"Ours: mean and median of {its.rounds} rounds in which the networks took turns, on one pair of "
         f"{its.source_vertices:,} (source) and {its.target_vertices:,} (target) vertices in float32 on "
-        f"{its.device} with {threads}; weights loaded, kernels warm. Lines marked '{THEIRS}' are the paper's own, on an {paper.INFERENCE_DEVICE} GPU: "
+        f"{its.device} with {threads}; weights loaded, kernels warm. Lines marked "
+        f" '{THEIRS}' are the paper's own, on an {paper.INFERENCE_DEVICE} GPU: "
         "another machine, so that only the order and the ratios of times can be compared."
     )
 
