@@ -52,7 +52,7 @@ def run_comparison(
         A training has failed or was stopped, see :func:`workflows.sweeping.judge`.
     """
     sweep, data = plan.sweep, str(out / "dataset.zarr")
-    refuse_conflicts(sweep, data, out)
+    refuse_conflicts(sweep, data, out, kind=plan.kind)
     with ExitStack() as around:
         begin = once(lambda: _begin(around, plan, out))
         outcomes = generate_and_train(

@@ -8,6 +8,7 @@ from pathlib import Path
 import mlflow
 import pytest
 
+from datagen.errors import RecipeError
 from training.evaluation import read_rows
 from training.record import read_record
 from workflows import comparing
@@ -102,6 +103,15 @@ def test_the_same_command_again_has_nothing_to_do(compared: tuple[Path, str]) ->
     before = {path: path.stat().st_mtime_ns for path in (out / "evaluation").rglob("*") if path.is_file()}
     said = run("compare", out, THREE)
     assert "trials: 3 of 3 skipped" in said and "evaluate: skipped" in said
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_an_ablation_leaves_the_folder_of_a_comparison_alone(compared: tuple[Path, str]) -> None:
+    out, _ = compared
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.name != ".lock"}
+    plan = plan_comparison(str(out.parent / "compare.yaml"), kind="ablation")
+    with pytest.raises(RecipeError, match=r"another kind of work: comparison .*--out"):
+        comparing.run_comparison(plan, out, comparing.Settings())
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
