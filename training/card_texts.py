@@ -97,8 +97,8 @@ MODEL_LIMITS = """\
 
 NETWORK_LIMITS = {
     "npt origin": "\n- Source and target must have equally many vertices: they are paired by number.",
-    "corenet3d": "\n- Memory grows with source vertices times target vertices, and the order of target vertices "
-    "matters: its generator convolves along it.",
+    "corenet3d": "\n- Time grows with source vertices times target vertices (memory does not), and the order of "
+    "target vertices matters: its generator convolves along it.",
 }
 
 

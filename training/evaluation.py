@@ -18,7 +18,7 @@ from datagen.errors import DsffnetError
 from datagen.grid import PoseType
 from datagen.store import Dataset, open_dataset
 from training import paper
-from training.checkpoint import require_checkpoint
+from training.checkpoint import Checkpoint, require_checkpoint
 from training.checkpoint_folder import AVERAGE, WEIGHTS, manifest_of
 from training.earlier import recipe_of
 from training.measuring import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
@@ -33,8 +33,10 @@ __all__ = [
     "Row",
     "evaluate",
     "evaluation_list",
+    "fingerprint_of",
     "measure_chunk",
     "method_name",
+    "needs_equal_counts",
     "read_rows",
     "require_pairable",
     "triples_in",
@@ -120,6 +122,11 @@ def triples_in(rows: Iterable[Row]) -> int:
     return len({(row.pose_type, row.triple) for row in rows})
 
 
+def needs_equal_counts(network: NetworkRecipe) -> bool:
+    """Whether a network pairs source and target by index, so that both must have as many vertices."""
+    return isinstance(network, NptRecipe) and network.variant == "origin"
+
+
 def require_pairable(name: str, network: NetworkRecipe, source: int, target: int, *, where: str) -> None:
     """Refuse a network that pairs source and target by index for meshes of different counts.
 
@@ -128,7 +135,7 @@ def require_pairable(name: str, network: NetworkRecipe, source: int, target: int
     EvaluationError
         Naming the method, the counts and ``where`` they are.
     """
-    if isinstance(network, NptRecipe) and network.variant == "origin" and source != target:
+    if needs_equal_counts(network) and source != target:
         raise EvaluationError(
             f"{name} pairs source and target vertex by vertex (training.network.variant 'origin'), but {where} has a "
             f"source of {source:,} vertices and a target of {target:,}. Evaluate it on a dataset of one vertex count, "
@@ -175,8 +182,13 @@ def _resolved(method: Method, dataset: Dataset, recipe: EvaluationRecipe) -> Con
         for number, triple in enumerate(evaluation_list(dataset, recipe, pose_type)):
             counts = dataset.vertex_count(int(triple[0])), dataset.vertex_count(int(triple[2]))
             require_pairable(method.name, network, *counts, where=f"{pose_type} triple {number} of {dataset.url}")
-    about = {"network": network.model_dump(mode="json"), "files": _hashes(checkpoint.path)}
-    return Contender(method.name, str(checkpoint.path), _digest(about))
+    return Contender(method.name, str(checkpoint.path), fingerprint_of(checkpoint))
+
+
+def fingerprint_of(checkpoint: Checkpoint) -> str:
+    """What tells weights from all others, wherever they lie: a hash of their network's recipe and of their files."""
+    network = recipe_of(checkpoint, network_only=True).network
+    return _digest({"network": network.model_dump(mode="json"), "files": _hashes(checkpoint.path)})
 
 
 def _hashes(weights: Path) -> dict[str, str]:

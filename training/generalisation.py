@@ -6,7 +6,7 @@ picture is then all that can be shown.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from datagen.errors import DatasetError
 from datagen.store import Dataset
-from training.evaluation import POSE_TYPES
+from training.measuring import POSE_TYPES, Score
 from training.robustness import NO_OP, Case, case_of
 from training.row_files import read_csv, write_csv
-from training.scores import Method, Score, mean_and_interval, normalised, transfer_each, values_of
+from training.scores import LoadedMethod, mean_and_interval, normalised, transfer_each
 from training.tables import markdown
 
 
@@ -102,7 +102,7 @@ def cases_between(source: Kind, target: Kind, count: int) -> list[Case]:
 
 
 def measured(
-    methods: Sequence[Method], kinds: Sequence[Kind], *, triples: int, done: Sequence[GeneralisationRow] = ()
+    methods: Sequence[LoadedMethod], kinds: Sequence[Kind], *, triples: int, done: Sequence[GeneralisationRow] = ()
 ) -> Iterator[list[GeneralisationRow]]:
     """Rows of every pair of kinds that has a truth, a list a pair: every method that ``done`` lacks.
 
@@ -122,13 +122,13 @@ def measured(
         yield rows
 
 
-def takes(method: Method, cases: Sequence[Case]) -> bool:
+def takes(method: LoadedMethod, cases: Sequence[Case]) -> bool:
     """Whether a method can take these cases' vertex counts."""
     equal = all(len(case.source.vertices) == len(case.target.vertices) for case in cases)
     return equal or not method.equal_counts
 
 
-def _scores(method: Method, cases: Sequence[Case]) -> list[Score]:
+def _scores(method: LoadedMethod, cases: Sequence[Case]) -> list[Score]:
     pairs = ((case.source.vertices, case.target.vertices) for case in cases)
     return [case.score(its) for case, its in zip(cases, transfer_each(method.network, pairs), strict=True)]
 
@@ -141,7 +141,7 @@ def _rows(key: tuple[str, str, str], cases: Sequence[Case], scores: Sequence[Sco
             *case.triple,
             len(case.source.vertices),
             len(case.target.vertices),
-            **values_of(its),
+            **asdict(its),
         )
         for case, its in zip(cases, scores, strict=True)
     ]
@@ -166,11 +166,6 @@ def no_op_line(rows: Sequence[GeneralisationRow], kinds: Sequence[str], field: s
     return np.where(known.any(0), np.where(known, grid, 0).sum(0) / np.maximum(known.sum(0), 1), np.nan)
 
 
-def methods_in(rows: Sequence[GeneralisationRow]) -> list[str]:
-    """Trained methods in the order of the rows."""
-    return [name for name in dict.fromkeys(row.method for row in rows) if name != NO_OP]
-
-
 def grid_table(
     rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str, *, field: str = "pmd", factor: float = 1e4
 ) -> str:
@@ -193,4 +188,4 @@ def write_rows(rows: Sequence[GeneralisationRow], path: Path) -> None:
 
 def read_rows(path: Path) -> list[GeneralisationRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return read_csv(path, GeneralisationRow)
+    return read_csv(path, GeneralisationRow) if path.exists() else []

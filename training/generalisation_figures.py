@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from datagen.mesh import Mesh, bounding_box
 from training.figure_style import DPI, INK, PAGE, saved
 from training.figures import ROLE_COLORS
-from training.generalisation import GeneralisationRow, grid_of, methods_in, no_op_line
+from training.generalisation import GeneralisationRow, grid_of, no_op_line
 from training.mesh_grid import Panel, Row, mesh_grid, standing
-from training.robustness import NO_OP, Case
-from training.scores import Method, transfer_each
+from training.robustness import NO_OP, Case, methods_in
+from training.scores import LoadedMethod, in_words, transfer_each
 
 _COLORS = colormaps["YlGnBu"]
 _NO_TRUTH = "#eceef1"
@@ -97,7 +97,7 @@ def _broken(name: str) -> str:
 
 
 def generalisation_picture(
-    shown: Sequence[Shown], methods: Sequence[Method], path: str | os.PathLike[str], *, title: str
+    shown: Sequence[Shown], methods: Sequence[LoadedMethod], path: str | os.PathLike[str], *, title: str
 ) -> Path:
     """Draw source, target, each method's output and the ground truth (where known) of transfers, one a row."""
     columns = ["source\ngives the pose", "target\ngives the identity", *(f"{its.name}\noutput" for its in methods)]
@@ -105,7 +105,7 @@ def generalisation_picture(
     return mesh_grid(page, path, columns=[*columns, "ground truth\n"], title=title, one_scale=False)
 
 
-def _panels(shown: Shown, methods: Sequence[Method]) -> list[Panel | str]:
+def _panels(shown: Shown, methods: Sequence[LoadedMethod]) -> list[Panel | str]:
     case = shown.case
     size = float(bounding_box(case.target.vertices).half)  # a horse beside a person: each drawn as large as the other
     source = case.source.vertices * size / float(bounding_box(case.source.vertices).half)
@@ -118,7 +118,7 @@ def _panels(shown: Shown, methods: Sequence[Method]) -> list[Panel | str]:
     return [*found, truth if shown.truth_known else ""]
 
 
-def _output(shown: Shown, method: Method) -> Panel | str:
+def _output(shown: Shown, method: LoadedMethod) -> Panel | str:
     case = shown.case
     if method.equal_counts and len(case.source.vertices) != len(case.target.vertices):
         return "needs as many\nvertices as the target"
@@ -126,7 +126,7 @@ def _output(shown: Shown, method: Method) -> Panel | str:
     box = bounding_box(case.truth.vertices)
     vertices = standing(box.restore(output), case.truth.vertices if shown.truth_known else None)
     found = case.score(output)
-    caption = found.words if shown.truth_known else "no ground truth"
+    caption = in_words(found) if shown.truth_known else "no ground truth"
     return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
 
 

@@ -1,11 +1,11 @@
-"""Measuring some methods on one chunk of evaluation triples: the work of one task of an evaluation.
+"""Every metric of outputs, and measuring some methods on one chunk of triples: the work of one task of an evaluation.
 
 The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
 (right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,21 @@ from training.inference import load_trained, predict
 from training.recipe import EvaluationRecipe
 from training.rows import Row
 
+
+@dataclass(frozen=True)
+class Score:
+    """Metrics of one output, as the last fields of :class:`training.rows.Row`; NaN: not measured, or not finite."""
+
+    pmd: float
+    pmd_recentred: float
+    chamfer: float
+    earth_mover: float
+    millimetres: float
+    edge_ratio: float
+    normal_degrees: float
+
+
+METRICS = tuple(field.name for field in fields(Score))
 NO_OPS = ("target unchanged", "source unchanged")
 POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 
@@ -59,9 +74,9 @@ def measure_chunk(
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
     batch, groups = read_batch(dataset, triples, padded=True), _groups(dataset, triples)
     return [
-        Row(contender.name, pose_type, start + place, *map(int, triple), *values)
+        Row(contender.name, pose_type, start + place, *map(int, triple), *astuple(score))
         for contender in contenders
-        for place, (triple, values) in enumerate(
+        for place, (triple, score) in enumerate(
             zip(triples, _measure_each(groups, _output(contender, batch), batch.truth, recipe), strict=True)
         )
     ]
@@ -101,25 +116,49 @@ def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Gr
     return _Group(places, dataset.vertex_count(identity), edges, triangles, torch.tensor(metres, dtype=torch.float64))
 
 
-def _measure_each(
-    groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe
-) -> list[tuple[float, ...]]:
+def _measure_each(groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe) -> list[Score]:
     """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
-    found: dict[int, tuple[float, ...]] = {}
-    for group in groups:
-        ours, right = output[group.places, : group.count], truth[group.places, : group.count]
-        found |= zip(group.places, _measure(ours, right, group, recipe), strict=True)
+    found: dict[int, Score] = {}
+    for its in groups:
+        ours, right = output[its.places, : its.count], truth[its.places, : its.count]
+        about: dict[str, Any] = {"emd_points": recipe.emd_points, "seed": recipe.seed}
+        scores = measure(ours, right, edges=its.edges, faces=its.faces, metres=its.metres, **about)
+        found |= zip(its.places, scores, strict=True)
     return [found[place] for place in range(len(found))]
 
 
-def _measure(output: Tensor, truth: Tensor, group: _Group, recipe: EvaluationRecipe) -> list[tuple[float, ...]]:
+def measure(
+    output: Tensor,
+    truth: Tensor,
+    *,
+    edges: Tensor,
+    faces: Tensor,
+    metres: Tensor,
+    emd_points: int | None,
+    seed: int = 0,
+) -> list[Score]:
+    """Every metric of outputs for one target (see :mod:`training.metrics`).
+
+    Parameters
+    ----------
+    output, truth
+        ``[b, v, 3]`` in the normalised box, vertex by vertex.
+    edges, faces
+        ``[e, 2]`` and ``[f, 3]`` int64, the target's.
+    metres
+        ``[b]`` float64, what one unit of the box is for each truth.
+    emd_points, seed
+        Vertices of the earth mover's distance (None: it is not measured), and the seed they are drawn by.
+    """
     columns = (
         metrics.point_mesh_distance(output, truth),
         metrics.recentred_point_mesh_distance(output, truth),
         metrics.chamfer_distance(output, truth),
-        metrics.earth_mover_distance(output, truth, points=recipe.emd_points, seed=recipe.seed),
-        metrics.mean_euclidean_error(output, truth) * group.metres * 1000,
-        metrics.edge_length_ratio_error(output, truth, group.edges),
-        metrics.normal_angle_error(output, truth, group.faces),
+        metrics.earth_mover_distance(output, truth, points=emd_points, seed=seed)
+        if emd_points
+        else torch.full((len(output),), torch.nan),
+        metrics.mean_euclidean_error(output, truth) * metres * 1000,
+        metrics.edge_length_ratio_error(output, truth, edges),
+        metrics.normal_angle_error(output, truth, faces),
     )
-    return list(zip(*(column.tolist() for column in columns), strict=True))
+    return [Score(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]

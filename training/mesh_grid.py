@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from datagen.mesh import Mesh
-from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.figure_style import PAGE, QUIET, saved
+from training.page import Page
 from training.rasteriser import Floats
 from training.rendering import Camera, MeshLike, frame, render_mesh
 
@@ -70,10 +70,10 @@ def mesh_grid(
     width = _LABELS + len(columns) * size[0] + _EDGE
     lines = textwrap.wrap(title, int((width - 2 * _EDGE) / _LETTER))
     header = 10 + len(lines) * _LINE + _HEADINGS
-    page = _Page(width, header + len(rows) * (size[1] + _CAPTION) + _EDGE)
+    page = Page(width=width, height=header + len(rows) * (size[1] + _CAPTION) + _EDGE)
     page.text(_EDGE, 10, "\n".join(lines), size=8, va="top", linespacing=1.35)
     for place, heading in enumerate(columns):
-        page.text(_LABELS + (place + 0.5) * size[0], header - 30, heading, size=7.5, ha="center", weight="bold")
+        page.text(_LABELS + (place + 0.5) * size[0], header - 30, heading, size=7.5, anchor="center", weight="bold")
     whole = _camera(rows, size) if one_scale else None
     for number, row in enumerate(rows):
         top = header + number * (size[1] + _CAPTION)
@@ -106,39 +106,13 @@ def _camera(rows: Sequence[Row], size: tuple[int, int]) -> Camera:
     )
 
 
-def _draw_row(page: "_Page", row: Row, camera: Camera, top: float, size: tuple[int, int]) -> None:
+def _draw_row(page: Page, row: Row, camera: Camera, top: float, size: tuple[int, int]) -> None:
     for place, panel in enumerate(row.panels):
         left = _LABELS + place * size[0]
         if isinstance(panel, str):
-            page.text(left + size[0] / 2, top + size[1] / 2, panel, size=6.5, color=QUIET, ha="center")
+            page.text(left + size[0] / 2, top + size[1] / 2, panel, size=6.5, color=QUIET, anchor="center")
             continue
         mesh = panel.mesh
         look: dict[str, Any] = {"colors": panel.colors, "camera": camera, "size": size, "background": PAGE}
         page.picture(render_mesh(mesh.vertices, mesh.faces, **look), left, top)
-        page.text(left + size[0] / 2, top + size[1] + 8, panel.caption, size=6.5, color=QUIET, ha="center")
-
-
-class _Page:
-    """A figure laid out in pixels from its top left corner."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self.width, self.height = width, height
-        self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAGE)
-
-    def text(self, x: float, y: float, words: str, *, size: float, **style: Any) -> None:
-        where = x / self.width, 1 - y / self.height
-        style = {"color": INK, "ha": "left", "va": "center", "parse_math": False, **style}
-        self.figure.text(*where, words, fontsize=size, **style)
-
-    def rule(self, y: float) -> None:
-        box = (_EDGE / self.width, 1 - y / self.height, 1 - 2 * _EDGE / self.width, 1 / self.height)
-        self.figure.add_axes(box, facecolor=RULE, xticks=[], yticks=[]).set_frame_on(True)
-        for spine in self.figure.axes[-1].spines.values():
-            spine.set_visible(False)
-
-    def picture(self, pixels: npt.NDArray[np.uint8], left: float, top: float) -> None:
-        height, width = pixels.shape[:2]
-        box = (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
-        axes = self.figure.add_axes(box)
-        axes.imshow(pixels, interpolation="none", aspect="auto")
-        axes.axis("off")
+        page.text(left + size[0] / 2, top + size[1] + 8, panel.caption, size=6.5, color=QUIET, anchor="center")

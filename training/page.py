@@ -32,12 +32,12 @@ class Page:
     def text(
         self, x: float, y: float, words: str, *, size: float, anchor: str = "left", room: float = np.inf, **style: Any
     ) -> None:
-        """Write words, vertically centred at y, in smaller letters where `room` pixels are too few for them."""
+        """Write words, in smaller letters where `room` pixels are too few; y is their middle, or what `va` says."""
         per_letter = (0.68 if style.get("weight") == "bold" else 0.6) * DPI / 72  # of a point, in this font
         size = min(size, max(room / (per_letter * max(len(words), 1)), 4.0))
-        style = {"color": INK, "parse_math": False, **style}  # names may hold dollar signs
+        style = {"color": INK, "parse_math": False, "va": "center", **style}  # names may hold dollar signs
         where = x / self.width, 1 - y / self.height
-        self.figure.text(*where, words, fontsize=size, ha=anchor, va="center", **style)
+        self.figure.text(*where, words, fontsize=size, ha=anchor, **style)
 
     def rule(self, y: float) -> None:
         """Draw a hairline across the page."""

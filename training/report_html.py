@@ -40,6 +40,7 @@ KINDS = {
 _BROAD = 900
 """Pixels from which on a picture is scrolled on a narrow screen, instead of being made too small to read."""
 
+_NUMBER = ' class="number"'
 _SHORT = 26
 """Letters of a cell up to which a line is not broken."""
 
@@ -112,7 +113,7 @@ def _block(block: Block, folder: Path) -> str:
 def _table(table: Table) -> str:
     heading, *lines = table.lines
     classes = [_class(table, place) for place in range(len(heading))]
-    head = "".join(f'<th scope="col"{c}>{html.escape(cell)}</th>' for cell, c in zip(heading, classes, strict=True))
+    head = "".join(f'<th scope="col"{c}>{_unbroken(cell)}</th>' for cell, c in zip(heading, classes, strict=True))
     rows = [
         ('<tr class="first">' if begins else "<tr>")
         + "".join(_cell(cell, c, head=place == 0) for place, (cell, c) in enumerate(zip(line, classes, strict=True)))
@@ -129,10 +130,14 @@ def _table(table: Table) -> str:
     )
 
 
+def _unbroken(heading: str) -> str:
+    return html.escape(heading).replace(" %", "&nbsp;%")
+
+
 def _class(table: Table, column: int) -> str:
-    """Numbers stand at the right; short words are not broken into two lines, and long ones have room."""
+    """Numbers stand at the right; short words are not broken, and long ones have room."""
     if table.numeric[column]:
-        return ' class="number"'
+        return _NUMBER
     short = all(len(line[column]) <= _SHORT for line in table.lines)
     return ' class="short"' if short else ' class="long"'
 
@@ -140,6 +145,7 @@ def _class(table: Table, column: int) -> str:
 def _cell(cell: str, attributes: str, *, head: bool) -> str:
     its = cell_of(cell)
     text = html.escape(its.text)
+    text = text.replace(" (", "<br>(") if attributes == _NUMBER else text  # an interval stands below its number
     text = f"<em>{text}</em>" if its.italic else text
     text = f"<strong>{text}</strong>" if its.bold else text
     return f'<th scope="row"{attributes}>{text}</th>' if head else f"<td{attributes}>{text}</td>"

@@ -1,13 +1,14 @@
-"""How a trained network bears a spoilt source (paper, Figure 9): rows, curves, tables.
+"""How a trained network bears a spoilt source (paper, Figure 9): rows. Curves and tables: ``robustness_tables``.
 
 The source alone is disturbed, before its normalisation, as a person's mesh would be; target and ground truth stay as
 they are. The no-op ``target unchanged`` says what doing nothing would score, whatever the source.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,16 @@ from datagen.errors import DatasetError
 from datagen.mesh import Mesh, bounding_box
 from datagen.store import Dataset
 from training.disturbances import DISTURBANCES, Disturbance
-from training.evaluation import POSE_TYPES
+from training.measuring import NO_OPS, POSE_TYPES, Score
 from training.row_files import read_csv, write_csv
-from training.scores import Method, Score, mean_and_interval, normalised, score, transfer_each, values_of
-from training.tables import markdown
+from training.scores import LoadedMethod, normalised, score, transfer_each
 
-NO_OP = "target unchanged"
+NO_OP = NO_OPS[0]
+
+
+class _OfMethod(Protocol):
+    @property
+    def method(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -72,15 +77,6 @@ class RobustnessRow:
         return self.method, self.disturbance, self.amount
 
 
-@dataclass(frozen=True)
-class Level:
-    """Mean of a metric over the triples at one amount, and half the width of its 95 % interval."""
-
-    amount: float
-    mean: float
-    interval: float
-
-
 def cases_of(dataset: Dataset, count: int) -> list[Case]:
     """The first ``count`` of a dataset's fixed evaluation triples, with unseen poses where it has any.
 
@@ -121,13 +117,13 @@ def disturbed(case: Case, disturbance: Disturbance, amount: float) -> Mesh:
     return disturbance.apply(case.source, amount, case.number)
 
 
-def refusal(method: Method, disturbance: Disturbance) -> str:
+def refusal(method: LoadedMethod, disturbance: Disturbance) -> str:
     """Why a method cannot take a disturbance; empty where it can."""
     return "" if disturbance.keeps_count else method.equal_counts
 
 
 def measured(
-    methods: Sequence[Method],
+    methods: Sequence[LoadedMethod],
     cases: Sequence[Case],
     disturbances: Sequence[Disturbance] = DISTURBANCES,
     *,
@@ -145,7 +141,9 @@ def measured(
             yield _measure(method, cases, disturbance, amount, emd_points)
 
 
-def steps(methods: Sequence[Method], disturbances: Sequence[Disturbance]) -> list[tuple[Disturbance, Method, float]]:
+def steps(
+    methods: Sequence[LoadedMethod], disturbances: Sequence[Disturbance]
+) -> list[tuple[Disturbance, LoadedMethod, float]]:
     """What is measured, in order; without what a method cannot take."""
     return [
         (disturbance, method, float(amount))
@@ -157,7 +155,7 @@ def steps(methods: Sequence[Method], disturbances: Sequence[Disturbance]) -> lis
 
 
 def _measure(
-    method: Method, cases: Sequence[Case], disturbance: Disturbance, amount: float, emd_points: int | None
+    method: LoadedMethod, cases: Sequence[Case], disturbance: Disturbance, amount: float, emd_points: int | None
 ) -> list[RobustnessRow]:
     sources = [disturbed(case, disturbance, amount).vertices for case in cases]
     outputs = transfer_each(method.network, zip(sources, (case.target.vertices for case in cases), strict=True))
@@ -169,74 +167,14 @@ def _rows(
     key: tuple[str, str, float], cases: Sequence[Case], counts: Sequence[int], scores: Sequence[Score]
 ) -> list[RobustnessRow]:
     return [
-        RobustnessRow(*key, case.number, *case.triple, count, **values_of(its))
+        RobustnessRow(*key, case.number, *case.triple, count, **asdict(its))
         for case, count, its in zip(cases, counts, scores, strict=True)
     ]
 
 
-def curve(rows: Sequence[RobustnessRow], method: str, disturbance: str, field: str = "pmd") -> list[Level]:
-    """The metric at every amount of a disturbance that rows have of a method, ascending."""
-    found: dict[float, list[float]] = {}
-    for row in rows:
-        if (row.method, row.disturbance) == (method, disturbance):
-            found.setdefault(row.amount, []).append(getattr(row, field))
-    return [Level(amount, *mean_and_interval(found[amount])) for amount in sorted(found)]
-
-
-def no_op(rows: Sequence[RobustnessRow], field: str = "pmd") -> float:
-    """What returning the target unchanged scores."""
-    return mean_and_interval([getattr(row, field) for row in rows if row.method == NO_OP])[0]
-
-
-def doubled(levels: Sequence[Level]) -> float | None:
-    """The first measured amount at which the mean is twice that of amount 0; None where none is."""
-    return next((level.amount for level in levels if level.mean >= 2 * levels[0].mean), None)
-
-
-def methods_in(rows: Sequence[RobustnessRow]) -> list[str]:
+def methods_in(rows: Sequence[_OfMethod]) -> list[str]:
     """Trained methods in the order of the rows."""
     return [name for name in dict.fromkeys(row.method for row in rows) if name != NO_OP]
-
-
-def limits_table(rows: Sequence[RobustnessRow]) -> str:
-    """Markdown: for each disturbance the amount at which each method's PMD has doubled, and the PMD at the most."""
-    names = methods_in(rows)
-    heads = [head for name in names for head in (f"{name}: doubled at", "PMD at the most")]
-    lines = [["disturbance", "amount (unit)", *heads]]
-    for disturbance in DISTURBANCES:
-        curves = [curve(rows, name, disturbance.name) for name in names]
-        if any(curves):
-            span = f"{disturbance.amounts[0]:g} to {disturbance.amounts[-1]:g} ({disturbance.unit})"
-            lines.append([disturbance.heading, span, *(cell for levels in curves for cell in _limit(levels))])
-    return markdown(lines)
-
-
-def _limit(levels: Sequence[Level]) -> tuple[str, str]:
-    if not levels:
-        return "not taken", ""
-    amount = doubled(levels)
-    return "never" if amount is None else f"{amount:g}", f"{levels[-1].mean * 1e4:.2f}"
-
-
-def amounts_table(rows: Sequence[RobustnessRow]) -> str:
-    """Markdown: PMD (1e-4) and millimetres of every method at every amount of every disturbance."""
-    names = methods_in(rows)
-    lines = [["disturbance", "amount", *(head for name in names for head in (f"{name} PMD x1e-4", "+- 95 %", "mm"))]]
-    for disturbance in DISTURBANCES:
-        pmd = {name: curve(rows, name, disturbance.name) for name in names}
-        metres = {name: curve(rows, name, disturbance.name, "millimetres") for name in names}
-        amounts = sorted({level.amount for levels in pmd.values() for level in levels})
-        for amount in amounts:
-            cells = [cell for name in names for cell in _cells(pmd[name], metres[name], amount)]
-            lines.append([disturbance.heading, f"{amount:g}", *cells])
-    return markdown(lines)
-
-
-def _cells(pmd: Sequence[Level], millimetres: Sequence[Level], amount: float) -> tuple[str, str, str]:
-    for level, distance in zip(pmd, millimetres, strict=True):
-        if level.amount == amount:
-            return f"{level.mean * 1e4:.2f}", f"{level.interval * 1e4:.2f}", f"{distance.mean:.1f}"
-    return "", "", ""
 
 
 def write_rows(rows: Sequence[RobustnessRow], path: Path) -> None:
@@ -246,4 +184,4 @@ def write_rows(rows: Sequence[RobustnessRow], path: Path) -> None:
 
 def read_rows(path: Path) -> list[RobustnessRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return read_csv(path, RobustnessRow)
+    return read_csv(path, RobustnessRow) if path.exists() else []

@@ -14,8 +14,9 @@ from training.disturbances import DISTURBANCES, Disturbance
 from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
 from training.figures import ROLE_COLORS
 from training.mesh_grid import Panel, Row, drawable, mesh_grid, standing
-from training.robustness import Case, RobustnessRow, curve, disturbed, methods_in, no_op, refusal
-from training.scores import Method, transfer_each
+from training.robustness import Case, RobustnessRow, disturbed, methods_in, refusal
+from training.robustness_tables import curve, no_op
+from training.scores import LoadedMethod, in_words, transfer_each
 
 METHOD_COLORS = ("#d1462f", "#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")
 _ABREAST = 5
@@ -116,7 +117,7 @@ def _style(axes: Axes) -> None:
 
 def disturbance_picture(
     case: Case,
-    methods: Sequence[Method],
+    methods: Sequence[LoadedMethod],
     chosen: Sequence[tuple[Disturbance, float]],
     path: str | os.PathLike[str],
     *,
@@ -149,11 +150,11 @@ def _heading(disturbance: Disturbance, amount: float) -> str:
     return f"{disturbance.heading}\n{words}"
 
 
-def _output(method: Method, case: Case, source: Mesh) -> Panel:
+def _output(method: LoadedMethod, case: Case, source: Mesh) -> Panel:
     (output,) = transfer_each(method.network, [(source.vertices, case.target.vertices)])
     found = case.score(output)
     vertices = standing(bounding_box(case.truth.vertices).restore(output), case.truth.vertices)
-    caption = found.words
+    caption = in_words(found)
     return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
 
 

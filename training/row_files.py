@@ -22,9 +22,7 @@ def write_csv(rows: Sequence[Any], path: Path, kind: type[Any]) -> None:
 
 
 def read_csv(path: Path, kind: type[RowType]) -> list[RowType]:
-    """Rows that :func:`write_csv` wrote; none where there is no file."""
-    if not path.exists():
-        return []
+    """Rows that :func:`write_csv` wrote."""
     types: dict[str, Any] = {field.name: field.type for field in fields(kind)}  # type: ignore[arg-type]
-    with open(path, encoding="utf-8") as file:
+    with open(path, encoding="utf-8", newline="") as file:
         return [kind(**{name: its(line[name]) for name, its in types.items()}) for line in csv.DictReader(file)]

@@ -1,13 +1,12 @@
 """Rows of an evaluation (one a triple and method) as CSV, and finished pieces of one kept for its next start."""
 
 import csv
-import io
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.mesh import write_atomically
+from training.row_files import read_csv, write_csv
 
 _PIECE = re.compile(r"(seen|unseen)-\d{5,}-[0-9a-f]{32}\.csv")
 
@@ -37,20 +36,12 @@ class Row:
 
 def write_rows(rows: list[Row], path: Path) -> None:
     """Write rows as CSV, at once."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(Row)])
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    write_atomically(path, text.getvalue().encode())
+    write_csv(rows, path, Row)
 
 
 def read_rows(path: Path) -> list[Row]:
     """Rows of a CSV that :func:`write_rows` wrote."""
-    with open(path, encoding="utf-8", newline="") as file:
-        return [
-            Row(**{field.name: field.type(line[field.name]) for field in fields(Row)})  # type: ignore[operator]
-            for line in csv.DictReader(file)
-        ]
+    return read_csv(path, Row)
 
 
 def piece_name(pose_type: str, start: int, fingerprint: str) -> str:

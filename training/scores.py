@@ -1,11 +1,10 @@
-"""Outputs of networks on pairs of any vertex counts, and every metric of one output."""
+"""Networks in memory, their outputs on pairs of any vertex counts, and every metric of one output."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,22 +12,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datagen.mesh import bounding_box, edges_of
-from training import metrics
+from training.evaluation import method_name, needs_equal_counts
 from training.inference import load_trained
-from training.recipe import NetworkRecipe
-from training.recipe_networks import NptRecipe
+from training.measuring import Score, measure
 
-TITLES = {"dsffnet": "DSFFNet", "npt": "NPT", "corenet3d": "3D-CoreNet"}
-"""What networks are called in tables and figures."""
+_EQUAL_COUNTS = "NPT 'origin' pairs source and target vertex by vertex, so that it needs as many of both"
 _POINTS_AT_ONCE = 2**15  # source vertices and target vertices of pairs that go through a network together
 Vertices = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
-class Method:
-    """A trained network under the name that tables and figures have for it.
+class LoadedMethod:
+    """A trained network in memory, under the name that tables and figures have for it.
 
-    ``equal_counts`` says why it takes no source of another vertex count than the target's ("": it takes any).
+    :class:`training.measuring.Method` is one by the place of its weights alone. ``equal_counts`` says why it takes no
+    source of another vertex count than the target's ("": it takes any).
     """
 
     name: str
@@ -38,30 +36,8 @@ class Method:
     equal_counts: str = ""
 
 
-@dataclass(frozen=True)
-class Score:
-    """Metrics of one output, as :class:`training.evaluation.Row` has them; NaN: not measured."""
-
-    pmd: float
-    pmd_recentred: float
-    chamfer: float
-    earth_mover: float
-    millimetres: float
-    edge_ratio: float
-    normal_degrees: float
-
-    @property
-    def words(self) -> str:
-        """PMD and millimetres, for a caption."""
-        pmd = self.pmd * 1e4
-        return f"PMD {pmd:.{1 if pmd < 99.95 else 0}f}e-4, {self.millimetres:.0f} mm"
-
-
-SCORES = tuple(field.name for field in fields(Score))
-
-
-def load_methods(places: Sequence[Path], *, labels: Sequence[str]) -> list[Method]:
-    """The networks of some weights, named after their kind and, where that is not unique, by their label too.
+def load_methods(places: Sequence[Path], *, labels: Sequence[str]) -> list[LoadedMethod]:
+    """The networks of some weights, named as evaluations name them and, where that is not unique, by their label too.
 
     Raises
     ------
@@ -69,10 +45,10 @@ def load_methods(places: Sequence[Path], *, labels: Sequence[str]) -> list[Metho
         A place has no usable weights.
     """
     loaded = [load_trained(place) for place in places]
-    titles = [TITLES.get(recipe.network.name, recipe.network.name) for _, recipe, _ in loaded]
+    titles = [method_name(recipe.network) for _, recipe, _ in loaded]
     names = _told_apart(titles, labels)
     return [
-        Method(name, network, step, str(place), _needs_equal_counts(recipe.network))
+        LoadedMethod(name, network, step, str(place), _EQUAL_COUNTS if needs_equal_counts(recipe.network) else "")
         for name, place, (network, recipe, step) in zip(names, places, loaded, strict=True)
     ]
 
@@ -86,12 +62,6 @@ def _told_apart(titles: Sequence[str], labels: Sequence[str]) -> list[str]:
         name if named.count(name) == 1 else f"{name} ({named[: place + 1].count(name)})"
         for place, name in enumerate(named)
     ]
-
-
-def _needs_equal_counts(recipe: NetworkRecipe) -> str:
-    if isinstance(recipe, NptRecipe) and recipe.variant == "origin":
-        return "NPT 'origin' pairs source and target vertex by vertex, so that it needs as many of both"
-    return ""
 
 
 def normalised(vertices: Vertices) -> NDArray[np.float32]:
@@ -136,20 +106,15 @@ def score(
         Vertices of the earth mover's distance; None: not measured (NaN).
     """
     ours, right = (torch.from_numpy(np.asarray(mesh, np.float64))[None] for mesh in (output, truth))
-    moved = metrics.earth_mover_distance(ours, right, points=emd_points) if emd_points else torch.tensor([torch.nan])
-    triangles = torch.from_numpy(np.asarray(faces, np.int64))
-    found = (
-        metrics.point_mesh_distance(ours, right),
-        metrics.recentred_point_mesh_distance(ours, right),
-        metrics.chamfer_distance(ours, right),
-        moved,
-        metrics.mean_euclidean_error(ours, right) * half * 1000,
-        metrics.edge_length_ratio_error(
-            ours, right, torch.from_numpy(_edges(np.ascontiguousarray(faces, np.int64).tobytes()))
-        ),
-        metrics.normal_angle_error(ours, right, triangles),
-    )
-    return Score(*(float(value) for value in found))
+    triangles = np.ascontiguousarray(faces, np.int64)
+    return measure(
+        ours,
+        right,
+        edges=torch.from_numpy(_edges(triangles.tobytes())),
+        faces=torch.from_numpy(triangles),
+        metres=torch.tensor([half], dtype=torch.float64),
+        emd_points=emd_points,
+    )[0]
 
 
 @lru_cache(maxsize=16)
@@ -166,6 +131,7 @@ def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
     return float(numbers.mean()), float(1.96 * numbers.std(ddof=1) / np.sqrt(len(numbers)))
 
 
-def values_of(score: Score) -> dict[str, Any]:
-    """The metrics by name."""
-    return dict(zip(SCORES, astuple(score), strict=True))
+def in_words(score: Score) -> str:
+    """PMD and millimetres, for a caption."""
+    pmd = score.pmd * 1e4
+    return f"PMD {pmd:.{1 if pmd < 99.95 else 0}f}e-4, {score.millimetres:.0f} mm"

@@ -23,7 +23,8 @@ from workflows.sweeping import Runner, generate_and_train, judge, refuse_conflic
 from workflows.trial_runs import ray_trials
 from workflows.trials import Trial, write_sweep
 
-OWN = ("trials", "trials.yaml", ".sweep", "evaluation", "report.html", "report.md")
+REPORTS = ("report.html", "report.md")
+OWN = ("trials", "trials.yaml", ".sweep", "evaluation", *REPORTS)
 """What a comparison keeps in its folder, beyond what every workflow does."""
 
 
@@ -51,7 +52,7 @@ def run_comparison(
         A training has failed or was stopped, see :func:`workflows.sweeping.judge`.
     """
     sweep, data = plan.sweep, str(out / "dataset.zarr")
-    refuse_conflicts(sweep, data, out)
+    refuse_conflicts(sweep, data, out, kind=plan.kind)
     with ExitStack() as around:
         begin = once(lambda: _begin(around, plan, out))
         outcomes = generate_and_train(
@@ -66,7 +67,7 @@ def run_comparison(
             "evaluate",
             depends_on=[_learned(plan), weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
             intact=lambda: intact(out),
-            work=partial(evaluate_methods, plan, open_dataset(data), runs, out),
+            work=partial(_evaluate, plan, data, runs, out),
         )
         evaluated = run_stage(evaluate, out=out, before=begin)
         if evaluated or not (out / REPORT).exists():
@@ -93,12 +94,19 @@ def _tags(plan: ComparisonPlan, trial: Trial) -> dict[str, str]:
     return {"method": next(name for name, its in plan.methods.items() if its == trial)}
 
 
+def _evaluate(plan: ComparisonPlan, data: str, runs: Mapping[str, Path], out: Path) -> None:
+    """Evaluate; the report of an earlier evaluation goes first, or it would pass for this one's were this cut short."""
+    for name in REPORTS:
+        (out / name).unlink(missing_ok=True)
+    evaluate_methods(plan, open_dataset(data), runs, out)
+
+
 def _report(plan: ComparisonPlan, out: Path, runs: Mapping[str, Path], command: str) -> None:
     """Write the report, and give the parent record what a person wants to see first."""
     note = write_comparison_report(plan, out, runs, command=command)
     parent, child = read_record(out), read_record(out / "evaluation")
     assert parent is not None and child is not None
-    names = ("report.html", "report.md", "evaluation/tables.md", "evaluation/viewer.html", "evaluation/figures")
+    names = (*REPORTS, "evaluation/tables.md", "evaluation/viewer.html", "evaluation/figures")
     update_record(
         out,
         artifacts=["recipe.yaml", "trials.yaml", *(name for name in names if (out / name).exists())],

@@ -12,7 +12,7 @@ from training.ablation_figure import ablation_figure
 from training.batches import Batch, read_batch
 from training.checkpoint import require_checkpoint
 from training.convergence_figure import convergence_figure
-from training.evaluation import POSE_TYPES, Method, Row, evaluate, evaluation_list, write_rows
+from training.evaluation import POSE_TYPES, Method, Row, evaluate, evaluation_list, fingerprint_of, write_rows
 from training.inference import load_trained
 from training.inference_time import Inference, measure_inference
 from training.recipe import EvaluationRecipe
@@ -28,8 +28,8 @@ FOLDER = "evaluation"
 
 
 def weights_of(runs: Mapping[str, Path]) -> dict[str, str]:
-    """The checkpoint that each method is measured with, as a word that changes with it."""
-    return {name: require_checkpoint(run, "result").path.name for name, run in runs.items()}
+    """The weights that each method is measured with, as a word that changes with them."""
+    return {name: fingerprint_of(require_checkpoint(run, "result")) for name, run in runs.items()}
 
 
 def intact(out: Path) -> bool:

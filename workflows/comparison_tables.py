@@ -57,7 +57,7 @@ def as_markdown(plan: ComparisonPlan, tables: list[NamedTable], about: str) -> s
 
 
 def _costs(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path]) -> list[list[str]]:
-    lines = [["method", "steps", "triples", "minutes", "triples/s", "PMD unseen, last 3 evaluations"]]
+    lines = [["method", "steps", "triples", "minutes", "ms a triple", "PMD unseen, last 3 evaluations"]]
     for name, trial in plan.methods.items():
         training = trial.training
         steps = last_step_of(training, dataset)
@@ -65,7 +65,9 @@ def _costs(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path]) -> 
         seconds = float(curve.seconds[-1]) if len(curve) else float("nan")
         last = ", ".join(f"{pmd / PMD_UNIT:.1f}" for pmd in curve.pmd[-3:])
         triples = steps * training.batch
-        lines.append([name, f"{steps:,}", f"{triples:,}", f"{seconds / 60:.1f}", f"{triples / seconds:.0f}", last])
+        lines.append(
+            [name, f"{steps:,}", f"{triples:,}", f"{seconds / 60:.1f}", f"{1000 * seconds / triples:.1f}", last]
+        )
     return lines
 
 

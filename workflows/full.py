@@ -38,7 +38,7 @@ from workflows.pipeline import (
     train_stage,
 )
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
-from workflows.stages import Stage, once, run_stage
+from workflows.stages import Stage, once, refuse_other_kind, run_stage
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -66,6 +66,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
     """All stages of a recipe into the folder ``out``; finished ones are skipped, without so much as starting Ray."""
     data, run = str(out / "dataset.zarr"), out / "run"
     sections = recipe.model_dump(mode="json")
+    refuse_other_kind(out, "workflow")
     _refuse_conflicts(recipe, data, run)
     with ExitStack() as around:
         begin = once(lambda: _begin(around, recipe, out))

@@ -16,14 +16,13 @@ from training.generalisation import (
     grid_table,
     have_truth,
     measured,
-    methods_in,
     pairs_with_truth,
     read_rows,
     write_rows,
 )
 from training.generalisation_figures import Shown, generalisation_picture, heat_map
-from training.robustness import Case
-from training.scores import Method
+from training.robustness import Case, methods_in
+from training.scores import LoadedMethod
 from workflows.cluster import require_reachable
 from workflows.evaluated import Evaluated
 from workflows.kinds import OTHERS, TOPOLOGIES, Sizes, imported_kind, make_kinds, own_kind, own_recipe
@@ -126,7 +125,7 @@ def _trained(weights: Evaluated, kinds: Sequence[Kind]) -> str:
 
 
 def _measured(
-    folder: Path, settings: dict[str, Any], methods: Sequence[Method], kinds: Sequence[Kind], sizes: Sizes
+    folder: Path, settings: dict[str, Any], methods: Sequence[LoadedMethod], kinds: Sequence[Kind], sizes: Sizes
 ) -> list[GeneralisationRow]:
     same_settings(folder, settings)
     rows = read_rows(folder / "rows.csv")
@@ -181,7 +180,7 @@ def _metrics(rows: Sequence[GeneralisationRow], names: Sequence[str]) -> dict[st
 
 def report(
     rows: Sequence[GeneralisationRow],
-    methods: Sequence[Method],
+    methods: Sequence[LoadedMethod],
     kinds: Sequence[Kind],
     sizes: Sizes,
     trained: Sequence[str],

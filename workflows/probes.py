@@ -10,9 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
+from training.evaluation import fingerprint_of
 from training.record import read_record, update_record
-from training.scores import Method, load_methods
+from training.scores import LoadedMethod, load_methods
 from workflows.cluster import require_reachable
 from workflows.evaluated import Evaluated, evaluated, which_checkpoint
 
@@ -46,7 +48,7 @@ def weights_of(options: argparse.Namespace) -> list[Evaluated]:
     return [evaluated(place, options.checkpoint) for place in places]
 
 
-def methods_of(weights: Sequence[Evaluated]) -> list[Method]:
+def methods_of(weights: Sequence[Evaluated]) -> list[LoadedMethod]:
     """Their networks, named after their networks and, where that is not unique, their folders."""
     return load_methods([its.weights for its in weights], labels=[_shown(its) for its in weights])
 
@@ -59,13 +61,29 @@ def _shown(weights: Evaluated) -> str:
 
 
 def folder_of(options: argparse.Namespace, weights: Sequence[Evaluated], study: str) -> Path:
-    """Where results go: as asked; below the evaluations of the one run; or runs/STUDY."""
+    """Where results go: as asked; below the evaluations of the one run; or runs/STUDY.
+
+    Raises
+    ------
+    RecipeError
+        The folder that was asked for holds another run's record, or rows of something else.
+    """
     if options.out:
-        return Path(require_reachable(options.out, option="--out"))
+        folder = Path(require_reachable(options.out, option="--out"))
+        _require_own(folder, study)
+        return folder
     if len(weights) > 1:
         return Path("runs") / study
     name = "-".join(filter(None, ("evaluation", weights[0].label)))
     return weights[0].home / name / study
+
+
+def _require_own(folder: Path, study: str) -> None:
+    """Refuse a folder whose record or rows a study would replace by its own."""
+    record = read_record(folder)
+    if (record and record.name != study) or ((folder / "rows.csv").exists() and not (folder / _SETTINGS).exists()):
+        what = f"the record of {record.kind} {record.name!r}" if record else "rows of another study"
+        raise RecipeError(f"--out {folder} holds {what}, which this would replace. Choose a folder of its own")
 
 
 def parent_of(weights: Sequence[Evaluated]) -> Path | None:
@@ -76,7 +94,7 @@ def parent_of(weights: Sequence[Evaluated]) -> Path | None:
 
 def about_weights(weights: Sequence[Evaluated]) -> list[str]:
     """What tells these weights from all others, as plain data."""
-    return [f"{its.weights.resolve()} step {its.checkpoint.step} dataset {its.checkpoint.dataset}" for its in weights]
+    return [f"{its.weights.resolve()} step {its.checkpoint.step} {fingerprint_of(its.checkpoint)}" for its in weights]
 
 
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:

@@ -9,20 +9,7 @@ from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from datagen.store import open_dataset
 from training.disturbances import DISTURBANCES, Disturbance
-from training.robustness import (
-    Case,
-    RobustnessRow,
-    amounts_table,
-    cases_of,
-    curve,
-    limits_table,
-    measured,
-    no_op,
-    read_rows,
-    refusal,
-    steps,
-    write_rows,
-)
+from training.robustness import Case, RobustnessRow, cases_of, measured, read_rows, refusal, steps, write_rows
 from training.robustness_figures import (
     disturbance_picture,
     millimetres,
@@ -30,7 +17,8 @@ from training.robustness_figures import (
     one_of_each,
     robustness_curves,
 )
-from training.scores import Method
+from training.robustness_tables import amounts_table, curve, limits_table, no_op
+from training.scores import LoadedMethod
 from workflows.cluster import require_reachable
 from workflows.probes import about_weights, add_weights_options, folder_of, methods_of, same_settings, study, weights_of
 from workflows.progress import bar
@@ -98,7 +86,7 @@ def _require_example(options: argparse.Namespace, cases: Sequence[Case]) -> None
 def _measured(
     folder: Path,
     settings: dict[str, Any],
-    methods: Sequence[Method],
+    methods: Sequence[LoadedMethod],
     cases: Sequence[Case],
     disturbances: Sequence[Disturbance],
     options: argparse.Namespace,
@@ -117,7 +105,7 @@ def _measured(
     return rows
 
 
-def _draw(folder: Path, rows: Sequence[RobustnessRow], methods: Sequence[Method], case: Case) -> None:
+def _draw(folder: Path, rows: Sequence[RobustnessRow], methods: Sequence[LoadedMethod], case: Case) -> None:
     robustness_curves(rows, folder / "curves.png", title=f"A disturbed source: PMD over {_count(rows)} triples")
     who = "to identity {2} from identity {0}, pose {1}".format(*case.triple)
     title = f"Noise on the source, standard deviation in half the longest box edge ({who})"
@@ -126,7 +114,7 @@ def _draw(folder: Path, rows: Sequence[RobustnessRow], methods: Sequence[Method]
     disturbance_picture(case, methods, one_of_each(), folder / "disturbances.png", title=title)
 
 
-def _metrics(rows: Sequence[RobustnessRow], methods: Sequence[Method]) -> dict[str, float]:
+def _metrics(rows: Sequence[RobustnessRow], methods: Sequence[LoadedMethod]) -> dict[str, float]:
     """PMD (1e-4) at the most of each disturbance, as MLflow shows it: ``pmd/NOISE/METHOD``."""
     found = {}
     for method in methods:
@@ -140,7 +128,7 @@ def _metrics(rows: Sequence[RobustnessRow], methods: Sequence[Method]) -> dict[s
 
 def report(
     rows: Sequence[RobustnessRow],
-    methods: Sequence[Method],
+    methods: Sequence[LoadedMethod],
     disturbances: Sequence[Disturbance],
     *,
     data: str,
@@ -163,14 +151,14 @@ def report(
     )
 
 
-def _left_out(method: Method, disturbances: Sequence[Disturbance]) -> str:
+def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
     """A line that says what a method could not take, and why."""
     refused = [its for its in disturbances if refusal(method, its)]
     names = ", ".join(its.heading.lower() for its in refused)
     return f"- {method.name} without {names}: {refusal(method, refused[0])}.\n\n" if refused else ""
 
 
-def _undisturbed(rows: Sequence[RobustnessRow], method: Method) -> float:
+def _undisturbed(rows: Sequence[RobustnessRow], method: LoadedMethod) -> float:
     levels = [curve(rows, method.name, its.name) for its in DISTURBANCES]
     return next(its[0].mean * 1e4 for its in levels if its)
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
+from training.record import read_record
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,21 @@ def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
     write_atomically(mark, json.dumps({"fingerprint": stage.fingerprint, "seconds": seconds}).encode())
     say(f"{stage.name}: finished in {seconds:.0f} s")
     return True
+
+
+def refuse_other_kind(out: Path, kind: str) -> None:
+    """Refuse a folder that another kind of work has its record in: that, its recipe and its report would be replaced.
+
+    Raises
+    ------
+    RecipeError
+        It is one.
+    """
+    record = read_record(out)
+    if record and record.kind != kind:
+        raise RecipeError(
+            f"{out} is the folder of another kind of work: {record.kind} {record.name!r}. Choose another --out"
+        )
 
 
 def once(work: Callable[[], None]) -> Callable[[], None]:

@@ -20,7 +20,7 @@ from workflows.cluster import ray_cluster
 from workflows.console import WorkflowError, start_over
 from workflows.pipeline import check_run_accepts, generate_stage, is_complete, recorded
 from workflows.recipe import save_recipe
-from workflows.stages import Stage, once, run_stage, say
+from workflows.stages import Stage, once, refuse_other_kind, run_stage, say
 from workflows.sweep_progress import SweepProgress
 from workflows.sweep_report import FILES, Result, best_of, results_of, write_report
 from workflows.trial_runs import Outcome, Place, is_finished, prepare, ray_trials
@@ -65,7 +65,7 @@ def run_sweep(
         See :func:`judge`.
     """
     data = str(out / "dataset.zarr")
-    refuse_conflicts(sweep, data, out)
+    refuse_conflicts(sweep, data, out, kind="sweep")
     with ExitStack() as around:
         outcomes = generate_and_train(
             sweep,
@@ -174,8 +174,9 @@ def _tags(sweep: Sweep, trial: Trial) -> dict[str, str]:
     return {f"varied.{key}": value for key, value in varied_values(sweep, trial).items()}
 
 
-def refuse_conflicts(sweep: Sweep, data: str, out: Path) -> None:
-    """Refuse a folder whose dataset or trials were made by another recipe, before anything in it is touched."""
+def refuse_conflicts(sweep: Sweep, data: str, out: Path, *, kind: str) -> None:
+    """Refuse a folder of another kind of work, or made by another recipe, before anything in it is touched."""
+    refuse_other_kind(out, kind)
     if not (Path(data) / "zarr.json").exists():
         return
     group = open_group(data)

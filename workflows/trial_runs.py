@@ -6,7 +6,6 @@ checkpoint, so that nothing is done twice. What stops or fails a trial ends that
 
 import contextlib
 import signal
-import sys
 import threading
 import traceback
 import uuid
@@ -138,7 +137,9 @@ def ray_trials(
                 for reference in done:
                     yield _outcome(reference, running.pop(reference), place)
                 if told.is_set():
-                    sys.exit(TrainingStopped.exit_status)
+                    raise TrainingStopped(
+                        "told to stop, with a checkpoint of each trial. Run the same command again to go on"
+                    )
                 if not done:
                     yield None
     finally:

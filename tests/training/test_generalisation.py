@@ -26,7 +26,7 @@ from training.generalisation import (
 )
 from training.generalisation_figures import Shown, generalisation_picture, heat_map
 from training.networks import build_network
-from training.scores import Method
+from training.scores import LoadedMethod
 
 
 def leg(folder: Path, rings: int, **poses: int) -> Kind:
@@ -47,13 +47,15 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[Kind]:
 
 
 @pytest.fixture(scope="module")
-def method() -> Method:
+def method() -> LoadedMethod:
     torch.manual_seed(0)
-    return Method("DSFFNet", build_network("dsffnet", encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).eval(), 1, "")
+    return LoadedMethod(
+        "DSFFNet", build_network("dsffnet", encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).eval(), 1, ""
+    )
 
 
 @pytest.fixture(scope="module")
-def rows(kinds: list[Kind], method: Method) -> list[GeneralisationRow]:
+def rows(kinds: list[Kind], method: LoadedMethod) -> list[GeneralisationRow]:
     return [row for some in measured([method], kinds, triples=4) for row in some]
 
 
@@ -90,7 +92,7 @@ def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[Kind], rows: li
 
 
 def test_what_is_there_is_not_measured_again(
-    kinds: list[Kind], method: Method, rows: list[GeneralisationRow], tmp_path: Path
+    kinds: list[Kind], method: LoadedMethod, rows: list[GeneralisationRow], tmp_path: Path
 ) -> None:
     write_rows(rows, tmp_path / "rows.csv")
     again = [
@@ -99,7 +101,7 @@ def test_what_is_there_is_not_measured_again(
     assert again == []
 
 
-def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[Kind], method: Method) -> None:
+def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[Kind], method: LoadedMethod) -> None:
     equal = replace(method, equal_counts="it pairs vertices")
     found = [row for some in measured([equal], kinds[:2], triples=2) for row in some if row.method != NO_OP]
     assert found and all(row.source_vertices == row.target_vertices for row in found)
@@ -112,7 +114,7 @@ def test_a_kind_without_triples_is_refused(tmp_path: Path) -> None:
 
 
 def test_heat_map_and_picture_are_drawn(
-    tmp_path: Path, kinds: list[Kind], method: Method, rows: list[GeneralisationRow]
+    tmp_path: Path, kinds: list[Kind], method: LoadedMethod, rows: list[GeneralisationRow]
 ) -> None:
     names = [kind.name for kind in kinds]
     with Image.open(heat_map(rows, names, tmp_path / "heat.png", title="tiny", trained=[names[1]])) as picture:

@@ -73,6 +73,7 @@ def test_rounds_take_turns_and_the_median_leaves_out_the_warm_up(
     assert len({each[0] for each in rounds}) == 3, "each network is first in some round"
     assert {cost.seconds for cost in found.values()} == {1.0}
     assert sorted(cost.slowest for cost in found.values()) == [1.0, 1.0, 51.0]
+    assert sorted(cost.mean for cost in found.values()) == pytest.approx([1.0, 1.0, 53 / 3])
 
 
 def test_it_says_what_was_measured_and_leaves_the_threads_as_they_were(methods: list[Method]) -> None:

@@ -165,6 +165,12 @@ def test_intervals_and_differences_are_numbers_and_a_papers_own_stand_in_italics
     assert Table([["a"], ["*"], ["2 * 3"], ["** **"]]).numeric == [False]
 
 
+def test_an_interval_stands_below_its_number_and_words_in_brackets_stay_in_their_line(tmp_path: Path) -> None:
+    written(tmp_path, Table([["method", "PMD, 95 %"], ["NPT (ours)", "+1.00 (+0.50 to +1.50)"]], "A caption"))
+    page = (tmp_path / "report.html").read_text()
+    assert "+1.00<br>(+0.50 to +1.50)</td>" in page and "NPT (ours)" in page and "PMD, 95&nbsp;%" in page
+
+
 def test_lines_of_other_lengths_are_refused() -> None:
     with pytest.raises(ValueError, match="line 1 has 1 cells, its heading 2"):
         Table([["a", "b"], ["1"]])

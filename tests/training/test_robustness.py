@@ -14,24 +14,13 @@ from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset
 from training.batches import read_batch
 from training.disturbances import DISTURBANCES, Disturbance
+from training.measuring import METRICS
 from training.metrics import point_mesh_distance
 from training.networks import build_network
-from training.robustness import (
-    NO_OP,
-    Level,
-    RobustnessRow,
-    amounts_table,
-    cases_of,
-    curve,
-    doubled,
-    limits_table,
-    measured,
-    no_op,
-    read_rows,
-    write_rows,
-)
+from training.robustness import NO_OP, RobustnessRow, cases_of, measured, read_rows, write_rows
 from training.robustness_figures import disturbance_picture, robustness_curves
-from training.scores import SCORES, Method, mean_and_interval, score
+from training.robustness_tables import Level, amounts_table, curve, doubled, limits_table, no_op
+from training.scores import LoadedMethod, mean_and_interval, score
 
 BY_NAME = {its.name: its for its in DISTURBANCES}
 SOME = [BY_NAME["noise"], BY_NAME["subset"], BY_NAME["scale"]]
@@ -48,16 +37,18 @@ def network(name: str = "dsffnet", **options: object) -> torch.nn.Module:
 
 
 @pytest.fixture(scope="module")
-def method() -> Method:
-    return Method("DSFFNet", network(), step=3, place="here")
+def method() -> LoadedMethod:
+    return LoadedMethod("DSFFNet", network(), step=3, place="here")
 
 
 @pytest.fixture(scope="module")
-def rows(_pristine: Path, method: Method) -> list[RobustnessRow]:
+def rows(_pristine: Path, method: LoadedMethod) -> list[RobustnessRow]:
     return [row for some in measured([method], cases_of(open_dataset(str(_pristine)), 3), SOME) for row in some]
 
 
-def test_undisturbed_rows_are_what_evaluation_measures(dataset: str, method: Method, rows: list[RobustnessRow]) -> None:
+def test_undisturbed_rows_are_what_evaluation_measures(
+    dataset: str, method: LoadedMethod, rows: list[RobustnessRow]
+) -> None:
     opened = open_dataset(dataset)
     batch = read_batch(opened, opened.evaluation_triples("unseen")[:3])
     with torch.no_grad():
@@ -86,7 +77,7 @@ def test_triples_are_the_fixed_unseen_ones_and_counts_the_sources(dataset: str, 
         assert row.source_vertices == (max(round(32 * (1 - row.amount)), 3) if row.disturbance == "subset" else 32)
 
 
-def test_what_is_there_is_not_measured_again(dataset: str, method: Method, rows: list[RobustnessRow]) -> None:
+def test_what_is_there_is_not_measured_again(dataset: str, method: LoadedMethod, rows: list[RobustnessRow]) -> None:
     cases = cases_of(open_dataset(dataset), 3)
     kept = [row for row in rows if row.key != ("DSFFNet", "subset", 0.5)]
     (missing,) = measured([method], cases, SOME, done=kept)
@@ -96,7 +87,7 @@ def test_what_is_there_is_not_measured_again(dataset: str, method: Method, rows:
 
 
 def test_a_network_that_needs_equal_counts_gets_no_other(dataset: str) -> None:
-    origin = Method("NPT", network("npt", variant="origin"), 0, "", equal_counts="it pairs vertices")
+    origin = LoadedMethod("NPT", network("npt", variant="origin"), 0, "", equal_counts="it pairs vertices")
     found = [row for some in measured([origin], cases_of(open_dataset(dataset), 2), SOME) for row in some]
     assert {row.disturbance for row in found} == {"", "noise", "scale"}
     assert "not taken" in limits_table([*found, *(replace(row, method="X", disturbance="subset") for row in found)])
@@ -134,12 +125,14 @@ def test_scores_are_zero_for_the_truth_and_the_earth_mover_is_optional(dataset: 
     (case,) = cases_of(open_dataset(dataset), 1)
     truth = np.asarray(case.truth.vertices - case.truth.vertices.mean(0))
     found = score(truth, truth, case.target.faces, half=1.0, emd_points=8)
-    assert all(getattr(found, name) == pytest.approx(0, abs=1e-9) for name in SCORES)
+    assert all(getattr(found, name) == pytest.approx(0, abs=1e-9) for name in METRICS)
     moved = score(truth + 0.1, truth, case.target.faces, half=2.0)
     assert moved.millimetres == pytest.approx(1000 * 2 * 0.1 * np.sqrt(3)) and np.isnan(moved.earth_mover)
 
 
-def test_curves_and_picture_are_drawn(tmp_path: Path, dataset: str, method: Method, rows: list[RobustnessRow]) -> None:
+def test_curves_and_picture_are_drawn(
+    tmp_path: Path, dataset: str, method: LoadedMethod, rows: list[RobustnessRow]
+) -> None:
     with Image.open(robustness_curves(rows, tmp_path / "curves.png", title="tiny")) as picture:
         colors = np.asarray(picture.convert("RGB")).reshape(-1, 3)
         assert (np.abs(colors.astype(int) - (209, 70, 47)).sum(1) < 12).sum() > 200, "the method's line is there"

@@ -9,8 +9,11 @@ from pathlib import Path
 import mlflow
 import pytest
 
+from datagen.errors import RecipeError
 from training.evaluation import read_rows
 from training.record import read_record
+from workflows import comparing
+from workflows.comparison_plan import plan_comparison
 
 ROOT = Path(__file__).parents[2]
 LEGS = """
@@ -103,6 +106,30 @@ def test_the_same_command_again_has_nothing_to_do(compared: tuple[Path, str]) ->
     said = run("compare", out, THREE)
     assert "trials: 3 of 3 skipped" in said and "evaluate: skipped" in said
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_an_ablation_leaves_the_folder_of_a_comparison_alone(compared: tuple[Path, str]) -> None:
+    out, _ = compared
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.name != ".lock"}
+    plan = plan_comparison(str(out.parent / "compare.yaml"), kind="ablation")
+    with pytest.raises(RecipeError, match=r"another kind of work: comparison .*--out"):
+        comparing.run_comparison(plan, out, comparing.Settings())
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_no_report_of_an_earlier_evaluation_outlives_the_start_of_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_short(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    for name in comparing.REPORTS:
+        (tmp_path / name).write_text("of an earlier evaluation")
+    monkeypatch.setattr(comparing, "evaluate_methods", cut_short)
+    monkeypatch.setattr(comparing, "open_dataset", lambda url: None)
+    with pytest.raises(KeyboardInterrupt):
+        comparing._evaluate(plan_comparison("small", kind="comparison"), "data", {}, tmp_path)
+    assert not any((tmp_path / name).exists() for name in comparing.REPORTS)
 
 
 def test_an_ablation_trains_four_and_gives_table_three(tmp_path: Path) -> None:

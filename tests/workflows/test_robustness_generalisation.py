@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,13 @@ from datagen.recipe import AnnyBody, DatasetRecipe, NptPoses
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.generalisation import have_truth
-from training.record import read_record
+from training.record import begin_record, read_record
 from training.robustness import read_rows
 from training.trainer import train
 from workflows import generalisation, robustness
 from workflows.generalisation_command import add_generalisation_options, examples, generalisation_command
 from workflows.kinds import Sizes, animals_recipe, imported_kind, own_kind, own_recipe, people_recipe
-from workflows.probes import folder_of, weights_of
+from workflows.probes import about_weights, folder_of, weights_of
 
 
 @pytest.fixture
@@ -74,6 +75,25 @@ def test_impossible_wishes_are_refused(dataset: str, run: Path, tmp_path: Path, 
     with pytest.raises(RecipeError, match=message):
         robustness.main([str(run), "--data", dataset, "--out", str(tmp_path / "none"), *words])
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(("folder", "message"), [("run", "record of train"), ("rows", "rows of another study")])
+def test_a_study_replaces_nothing_of_others(dataset: str, run: Path, tmp_path: Path, folder: str, message: str) -> None:
+    (tmp_path / "rows").mkdir()
+    (tmp_path / "rows" / "rows.csv").write_text("mine")
+    begin_record(run, name="train", kind="train", parent=None, parameters={})
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(RecipeError, match=message):
+        robustness.main([str(run), "--data", dataset, "--out", str(tmp_path / folder), "--triples", "1"])
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_rows_of_other_weights_in_the_same_place_are_not_kept(dataset: str, run: Path, tmp_path: Path) -> None:
+    options = argparse.Namespace(runs=[str(run)], checkpoint="result", out=None)
+    before = about_weights(weights_of(options))
+    shutil.rmtree(run)
+    train(tiny_training(seed=1), data=dataset, run=run)
+    assert about_weights(weights_of(options)) != before
 
 
 def test_results_of_one_run_go_below_its_evaluations(run: Path) -> None:
