@@ -168,10 +168,12 @@ def _usage(home: Path) -> str:
 dsffnet transfer --model {run} --source pose.obj --target person.glb --out posed.glb
 
 # in Python
-from datagen.mesh import load_mesh, save_mesh
+from pathlib import Path
+from datagen.mesh_files import read_mesh_file, write_posed
 from training.transfer import PoseTransfer
-transfer = PoseTransfer.from_run("{run}")
-save_mesh(transfer(source=load_mesh("pose.obj"), target=load_mesh("person.obj")), "posed.glb")
+source, target = read_mesh_file("pose.obj"), read_mesh_file("person.glb")
+posed = PoseTransfer.from_run("{run}")(source=source.mesh, target=target.mesh)
+write_posed(target, posed.vertices, Path("posed.glb"))
 
 # from the registry, where MLflow has it
 import mlflow

@@ -12,13 +12,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from datagen.mesh import Mesh, bounding_box
 from training.disturbances import DISTURBANCES, Disturbance
 from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
-from training.figures import ROLE_COLORS
 from training.mesh_grid import Panel, Row, drawable, mesh_grid, standing
+from training.palette import ROLE_COLORS, method_colors
 from training.robustness import Case, RobustnessRow, disturbed, methods_in, refusal
 from training.robustness_tables import curve, no_op
 from training.scores import LoadedMethod, in_words, transfer_each
 
-METHOD_COLORS = ("#d1462f", "#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")
 _ABREAST = 5
 _BODY_METRES = 1.7
 
@@ -53,7 +52,7 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
 
 
 def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturbance) -> None:
-    for name, color in zip(methods_in(rows), _colors(methods_in(rows)), strict=True):
+    for name, color in method_colors(methods_in(rows)).items():
         levels = curve(rows, name, disturbance.name)
         at = [_place(disturbance, level.amount) for level in levels]
         mean, half = (np.array([getattr(level, key) for level in levels]) * 1e4 for key in ("mean", "interval"))
@@ -66,10 +65,6 @@ def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturb
     axes.set_xticks([_place(disturbance, amount) for amount in _ticks(disturbance)])
     axes.set_xticklabels([f"{amount:g}" for amount in _ticks(disturbance)])
     _style(axes)
-
-
-def _colors(names: Sequence[str]) -> list[str]:
-    return [METHOD_COLORS[number % len(METHOD_COLORS)] for number in range(len(names))]
 
 
 def _place(disturbance: Disturbance, amount: float) -> float:
