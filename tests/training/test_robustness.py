@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from datagen.errors import DatasetError
@@ -17,6 +18,7 @@ from training.disturbances import DISTURBANCES, Disturbance
 from training.measuring import METRICS
 from training.metrics import point_mesh_distance
 from training.networks import build_network
+from training.palette import method_colors
 from training.robustness import NO_OP, RobustnessRow, cases_of, measured, read_rows, write_rows
 from training.robustness_figures import disturbance_picture, robustness_curves
 from training.robustness_tables import Level, amounts_table, curve, doubled, limits_table, no_op
@@ -135,7 +137,8 @@ def test_curves_and_picture_are_drawn(
 ) -> None:
     with Image.open(robustness_curves(rows, tmp_path / "curves.png", title="tiny")) as picture:
         colors = np.asarray(picture.convert("RGB")).reshape(-1, 3)
-        assert (np.abs(colors.astype(int) - (209, 70, 47)).sum(1) < 12).sum() > 200, "the method's line is there"
+        line = [round(255 * level) for level in to_rgb(method_colors([method.name])[method.name])]
+        assert (np.abs(colors.astype(int) - line).sum(1) < 12).sum() > 200, "the method's line is there"
     chosen: list[tuple[Disturbance, float]] = [(BY_NAME["noise"], 0.1), (BY_NAME["area"], 1)]
     (case,) = cases_of(open_dataset(dataset), 1)
     path = disturbance_picture(case, [method], chosen, tmp_path / "noise.png", title="a title " * 20)
