@@ -26,7 +26,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster test-slow lint bench bench-generation bench-networks bench-input bench-training bench-gpu ui constraints clean
+.PHONY: help run test test-cluster test-slow lint bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -50,7 +50,7 @@ lint: $(READY) ## style, types, import rules
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-bench: bench-generation bench-networks bench-input bench-training ## every benchmark for a CPU
+bench: bench-generation bench-networks bench-input bench-training bench-transfer ## every benchmark for a CPU
 
 bench-generation: $(READY) ## making meshes: ratios to NPT's way and to Anny's own forward pass
 	@$(BIN)/python -m benchmarks.generation $(ARGS)
@@ -63,6 +63,9 @@ bench-input: $(READY) ## the share of a training step that waits for its batch, 
 
 bench-training: $(READY) ## two ranks of one thread each against one process of two threads
 	@$(BIN)/python -m benchmarks.training $(ARGS)
+
+bench-transfer: $(READY) ## one transfer of 6,890 vertices at the paper's widths, and the whole command
+	@$(BIN)/python -m benchmarks.transfer $(ARGS)
 
 bench-gpu: $(READY) ## DSFFNet on a GPU: fast against literal form, share of the chip's ceiling
 	@$(BIN)/python -m benchmarks.gpu $(ARGS)
