@@ -78,7 +78,8 @@ def _here(dataset: Dataset) -> str:
     span = f"{min(counts):,}" if min(counts) == max(counts) else f"{min(counts):,} to {max(counts):,}"
     learned = f"{len(dataset.identities('training'))} x {len(grid.poses('seen')):,}"
     return (
-        f"{dataset.recipe.body.family} bodies of {span} vertices, {len(identities)} new ones, {learned} meshes learned"
+        f"{dataset.recipe.body.family} bodies of {span} vertices, {len(identities)} new identities, "
+        f"{learned} meshes learned"
     )
 
 
