@@ -1,6 +1,6 @@
 """DSFFNet and its ablations under one budget on one dataset: the paper's Table 3 and its figure.
 
-    python workflows/ablation.py                                  # the recipe 'small': some 40 minutes on two cores
+    python workflows/ablation.py                                  # the recipe 'small': 6 minutes on two cores
     python workflows/ablation.py --recipe animals-small --out /tmp/animals
     python workflows/ablation.py --recipe paper --gpus-per-trial 1
     python workflows/ablation.py --set training.steps=500 --out runs/quick

@@ -1,6 +1,6 @@
 """DSFFNet, NPT and 3D-CoreNet under one budget on one dataset: the paper's Tables 1 and 2, and Figure 4.
 
-    python workflows/compare.py                                  # the recipe 'small': some 40 minutes on two cores
+    python workflows/compare.py                                  # the recipe 'small': 13 minutes on two cores
     python workflows/compare.py --recipe animals-small --out /tmp/animals
     python workflows/compare.py --recipe paper --gpus-per-trial 1
     python workflows/compare.py --set training.steps=500 --out runs/quick
