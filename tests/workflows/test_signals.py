@@ -18,8 +18,10 @@ def main():
         @ray.remote
         def work():
             time.sleep(300)
+        at_work = [work.remote()]
+        ray.wait(at_work, timeout=2)  # Ray's start of a worker is behind it, where Python code of Ray could swallow it
         print("at work", flush=True)
-        ray.wait([work.remote()])
+        ray.wait(at_work)
 
 guarded(main)
 """
