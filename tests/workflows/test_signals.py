@@ -9,6 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 WAITING = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite started in the background has Ctrl-C ignored
 from workflows.console import guarded
 from workflows.cluster import ray_cluster
 
@@ -18,10 +20,8 @@ def main():
         @ray.remote
         def work():
             time.sleep(300)
-        at_work = [work.remote()]
-        ray.wait(at_work, timeout=2)  # Ray's start of a worker is behind it, where Python code of Ray could swallow it
         print("at work", flush=True)
-        ray.wait(at_work)
+        ray.wait([work.remote()])
 
 guarded(main)
 """
