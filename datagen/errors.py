@@ -35,3 +35,7 @@ class ClusterError(DsffnetError):
 
 class StorageError(DsffnetError):
     """Files could not be written (full disk, no permission); what was there before is untouched."""
+
+
+class UnsafeFileError(DsffnetError):
+    """A file named by a dataset, run or mesh that leads out of its folder, is no regular file, or is far too long."""

@@ -1,0 +1,44 @@
+"""Files that somebody else named stay in their folder, are regular, and have a bounded size."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from datagen.errors import UnsafeFileError
+from datagen.files import read_bounded, resolve_within
+
+
+@pytest.mark.parametrize("name", ["", ".", "/etc/hostname", "../secret", "a/../../secret", "a\0b", "..\\secret"])
+def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UnsafeFileError):
+        resolve_within(tmp_path / "folder", name)
+
+
+def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "secret").write_text("s")
+    (tmp_path / "folder" / "file").symlink_to(tmp_path / "secret")
+    (tmp_path / "folder" / "below").symlink_to(tmp_path)
+    for name in ("file", "below/secret", "below/not-there"):
+        with pytest.raises(UnsafeFileError, match="link"):
+            resolve_within(tmp_path / "folder", name)
+
+
+def test_a_folder_that_is_itself_reached_by_a_link_is_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "folder" / "a").mkdir(parents=True)
+    (tmp_path / "other").symlink_to(tmp_path / "folder")
+    assert resolve_within(tmp_path / "other", "a/b") == tmp_path / "folder" / "a" / "b"
+
+
+def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"12345")
+    os.mkfifo(tmp_path / "pipe")
+    assert read_bounded(tmp_path / "file", limit=5) == b"12345"
+    with pytest.raises(UnsafeFileError, match="4 bytes"):
+        read_bounded(tmp_path / "file", limit=4)
+    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(UnsafeFileError, match="regular"):
+            read_bounded(path, limit=10)
+    with pytest.raises(FileNotFoundError):
+        read_bounded(tmp_path / "nothing", limit=5)
