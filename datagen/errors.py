@@ -4,6 +4,9 @@ Every message says what is wrong, where, the offending value, and the next comma
 prints it as one line and exits with ``exit_status``; nothing else of the traceback is shown.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class DsffnetError(Exception):
     """Base of all errors that are a person's business rather than a programmer's."""
@@ -39,3 +42,26 @@ class StorageError(DsffnetError):
 
 class UnsafeFileError(DsffnetError):
     """A file named by a dataset, run or mesh that leads out of its folder, is no regular file, or is far too long."""
+
+
+def reason_of(error: BaseException) -> str:
+    """Return what an exception says in one short line: the operating system's words, or its own."""
+    words = str(getattr(error, "strerror", None) or error)
+    line = " ".join(words.split()) or type(error).__name__
+    return line if len(line) <= 200 else f"{line[:200]}..."
+
+
+@contextmanager
+def storage_errors(place: object, *, advice: str, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Raise StorageError, with what to do about it, for an OSError (or ``also`` others) while ``place`` is written.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, the place cannot be written to, a device is out of order.
+    """
+    expected: tuple[type[Exception], ...] = (OSError, *also)
+    try:
+        yield
+    except expected as error:
+        raise StorageError(f"could not write {place}: {reason_of(error)}. {advice}") from error

@@ -6,6 +6,7 @@ may lead out of its folder, a link may lead anywhere, and a device such as /dev/
 
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path, PurePosixPath
 
 from datagen.errors import UnsafeFileError
@@ -29,6 +30,23 @@ def resolve_within(folder: Path, name: str) -> Path:
     return path
 
 
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file for reading, without waiting for anything.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is not a regular file (a device, a pipe, a folder).
+    OSError
+        It is not there, or cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not wait
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return open(descriptor, "rb")
+    os.close(descriptor)
+    raise UnsafeFileError(f"{path} is not a regular file")
+
+
 def read_bounded(path: Path, *, limit: int) -> bytes:
     """Return the content of a regular file of at most ``limit`` bytes.
 
@@ -39,15 +57,9 @@ def read_bounded(path: Path, *, limit: int) -> bytes:
     OSError
         It is not there, or cannot be read.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not wait
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise UnsafeFileError(f"{path} is not a regular file")
-        with open(descriptor, "rb", closefd=False) as file:
-            content = file.read(limit + 1)
-    finally:
-        os.close(descriptor)
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(min(limit, size) + 1)
     if len(content) > limit:
-        raise UnsafeFileError(f"{path} is longer than the {limit:,} bytes that it can have ({status.st_size:,})")
+        raise UnsafeFileError(f"{path} is longer than the {limit:,} bytes that it can have ({size:,})")
     return content

@@ -76,9 +76,9 @@ def ensure_shard(url: str, recipe: DatasetRecipe, shard: Shard, committed: str |
     DatasetError
         The dataset is being made by another recipe now, or from other assets than this machine has.
     """
-    require_driven(url, recipe)
+    group = require_driven(url, recipe)
     _require_same_assets(url, recipe.model_dump_json())
-    row = existing_shard(url, recipe, shard)
+    row = existing_shard(group, Grid(recipe), shard)
     if row is not None and committed in (None, row.sha256):
         return row
     return write_shard(url, recipe, shard, make_shard(recipe, shard), committed=committed)

@@ -76,11 +76,32 @@ class Grid:
 
     @property
     def identity_count(self) -> int:
-        return len(self._splits)
+        return sum(self._members(split) for split in SPLITS)
 
     @property
     def pose_count(self) -> int:
-        return len(self._pose_types)
+        return sum(step.seen + step.unseen for step in self.steps)
+
+    @property
+    def shard_count(self) -> int:
+        """Number of shards, from the recipe's counts alone: nothing is listed, however many they are."""
+        return sum(self._members(split) * -(-self._row_count(split) // self.rows_per_shard(split)) for split in SPLITS)
+
+    def _members(self, split: Split) -> int:
+        return sum(getattr(step, split) for step in self.steps)
+
+    def _row_count(self, split: Split) -> int:
+        """Rows of an array of a split's identities, holes included."""
+        rows, size = 0, self.rows_per_shard(split)
+        for step in self.steps:
+            count = self._poses_added(step, split)
+            rows = -(-rows // size) * size + count if count else rows
+        return rows
+
+    @staticmethod
+    def _poses_added(step: Growth, split: Split) -> int:
+        """Poses that a step gives to every identity of a split."""
+        return step.seen + (step.unseen if split == "evaluation" else 0)
 
     def split(self, identity: int) -> Split:
         """Which split identity number ``identity`` belongs to."""
@@ -126,7 +147,7 @@ class Grid:
         rows: NDArray[np.int64] = np.empty(0, np.int64)
         first = 0
         for step in self.steps:
-            count = step.seen + (step.unseen if split == "evaluation" else 0)
+            count = self._poses_added(step, split)
             if count:
                 holes = np.full(-len(rows) % self.rows_per_shard(split), HOLE, np.int64)
                 rows = np.concatenate([rows, holes, np.arange(first, first + count)])
@@ -135,9 +156,7 @@ class Grid:
 
     def rows_per_shard(self, split: Split) -> int:
         """Rows of a full shard: as the recipe says, but no more than the identities of a split had at first."""
-        base = self.steps[0]
-        first = base.seen + (base.unseen if split == "evaluation" else 0)
-        return min(self.recipe.store.poses_per_shard, first)
+        return min(self.recipe.store.poses_per_shard, self._poses_added(self.steps[0], split))
 
     def shards_of(self, identity: int) -> Iterator[Shard]:
         """Shards of one identity, in order; a shard never holds poses of two steps."""

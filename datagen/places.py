@@ -9,14 +9,10 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from datagen.errors import DatasetError
-from datagen.store.schema import NoDataset, check_ours, delete_object, list_objects, open_group, plain
+from datagen.store.objects import LocalObjects, is_local, plain
+from datagen.store.schema import NoDataset, check_ours, delete_object, list_objects, open_group
 
 _MEMBERS = ("topology", "identity", "pose", "evaluation", "manifest")
-
-
-def is_local(url: str) -> bool:
-    """Whether a store URL is a folder of a file system."""
-    return "://" not in plain(url)
 
 
 def remove(url: str) -> None:
@@ -33,6 +29,8 @@ def remove(url: str) -> None:
         return
     folder = Path(plain(url))
     for member in _MEMBERS:
+        if (folder / member).is_symlink():  # what it leads to is not ours
+            (folder / member).unlink()
         shutil.rmtree(folder / member, ignore_errors=not (folder / member).exists())
     (folder / "zarr.json").unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # something of the person's is in it
@@ -73,8 +71,7 @@ def require_ours(url: str) -> None:
 
 def _has_our_root(path: Path) -> bool:
     """Whether the folder's zarr.json is one that we wrote, be it damaged since."""
-    root = path / "zarr.json"
-    content = root.read_bytes() if root.is_file() else b""
+    content = LocalObjects(path).read("zarr.json") or b""
     return b'"format_version"' in content or b'"recipe_sha256"' in content
 
 

@@ -16,6 +16,7 @@ from datagen.errors import DatasetError
 from datagen.grid import POSE_TYPES, Grid
 from datagen.poses import load_poses
 from datagen.recipe import DatasetRecipe
+from datagen.store.root_attributes import attributes_fault
 from datagen.store.schema import FORMAT_VERSION, attributes_of, check_version, identity_name, stored_recipe
 
 _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
@@ -56,7 +57,10 @@ def _spans(numbers: NDArray[np.int64]) -> list[list[int]]:
 
 
 def check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:
-    stored = attributes_of(group).get("body", {}).get("assets", [])
+    fault = attributes_fault(group)
+    if fault:
+        raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
+    stored = attributes_of(group)["body"]["assets"]
     if _identities(stored) == _identities(present):
         return
     there, here = _identities(stored), _identities(present)
@@ -106,6 +110,8 @@ def provenance(earlier: Any) -> dict[str, Any]:
     now = {"packages": _versions(), "git_commit": _git_commit()}
     before = dict(earlier) if isinstance(earlier, dict) else {}
     history = before.pop("earlier", [])
+    if not isinstance(history, list):
+        history = []
     if before and before != now:
         history = [*history, before]
     return {**now, "earlier": history} if history else now

@@ -22,6 +22,10 @@ numcodecs.blosc.use_threads = False
 
 _NOTHING = 2**64 - 1
 _CHECKSUM = struct.Struct("<I")
+_BLOSC_HEADER = struct.Struct("<4B3I")  # two versions, flags, typesize; decoded, block and encoded bytes
+LARGEST_CHUNK = 2**31 - 17
+"""Bytes that Blosc can encode as one chunk; no other array is larger either."""
+_COMPRESSES, _SLACK = 1000, 2**24
 
 
 class ShardDamage(ValueError):
@@ -42,6 +46,21 @@ class ShardCodec:
         """Size of the index at the end of the file, its checksum included."""
         return 16 * self.rows + _CHECKSUM.size
 
+    @property
+    def mesh_bytes(self) -> int:
+        """Size of a decoded mesh."""
+        return 12 * self.vertices
+
+    @property
+    def most_chunk_bytes(self) -> int:
+        """The largest possible size of one encoded mesh: stored as it is, with Blosc's header and a checksum."""
+        return self.mesh_bytes + _BLOSC_HEADER.size + _CHECKSUM.size
+
+    @property
+    def most_bytes(self) -> int:
+        """The largest possible size of a file."""
+        return self.rows * self.most_chunk_bytes + self.index_bytes
+
     def encode(self, meshes: NDArray[np.float32]) -> bytes:
         """The file that holds meshes [row, vertex, 3]; fewer than ``rows`` leave the last ones empty."""
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
@@ -60,6 +79,7 @@ class ShardCodec:
         ShardDamage
             Cut short, a checksum that does not fit, or a mesh that is not there.
         """
+        require_plausible(rows * self.mesh_bytes, stored=len(file))
         index = self.decode_index(file[-self.index_bytes :])
         meshes, view = np.empty((rows, self.vertices, 3), np.float32), memoryview(file)
         for mesh, (offset, size) in zip(meshes, self.places(index, range(rows)), strict=True):
@@ -78,15 +98,34 @@ class ShardCodec:
             offset, size = map(int, index[row])
             if offset == _NOTHING:
                 raise ShardDamage(f"its row {row} is empty")
+            if size > self.most_chunk_bytes or offset > self.most_bytes:
+                raise ShardDamage(f"its row {row} lies at an impossible place")
             yield offset, size
 
     def decode_mesh(self, chunk: bytes | memoryview, out: NDArray[np.float32]) -> None:
         """Decode one chunk into ``out`` [vertex, 3]."""
         content = _unsealed(chunk, "a mesh")
+        if len(content) < _BLOSC_HEADER.size:
+            raise ShardDamage("a mesh has no header")
+        *_, decoded, _, encoded = _BLOSC_HEADER.unpack_from(content)
+        if (decoded, encoded) != (out.nbytes, len(content)):  # Blosc believes its header
+            raise ShardDamage(f"a mesh of {decoded} bytes instead of {out.nbytes}")
         try:
             numcodecs.blosc.decompress(content, out)
         except (RuntimeError, ValueError) as error:
             raise ShardDamage(f"a mesh cannot be decompressed ({error})") from error
+
+
+def require_plausible(decoded: int, *, stored: int) -> None:
+    """Refuse an array that is far larger than its stored bytes can mean, before memory is taken for it.
+
+    Raises
+    ------
+    ShardDamage
+        It is a thousand times as large (meshes compress to a half, at best to some hundredth).
+    """
+    if decoded > _COMPRESSES * stored + _SLACK:
+        raise ShardDamage(f"its {decoded:,} bytes cannot be stored in {stored:,}")
 
 
 def _sealed(content: bytes) -> bytes:

@@ -7,11 +7,24 @@ a dataset can change unnoticed.
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import zarr
+from pydantic import TypeAdapter
 
-from datagen.store.schema import ManifestRow, attributes_of, list_objects, read_bytes, require_group
+from datagen.errors import UnsafeFileError, reason_of
+from datagen.grid import Grid
+from datagen.store.objects import is_member, require_member
+from datagen.store.schema import (
+    ManifestRow,
+    attributes_of,
+    list_objects,
+    parse_json,
+    read_bytes,
+    require_group,
+    shard_path,
+)
 
 _ROOT, _MANIFEST = "zarr.json", "manifest/zarr.json"
 _SEAL = "attributes_sha256"
@@ -29,9 +42,43 @@ def commit(group: zarr.Group, rows: Sequence[ManifestRow], attributes: dict[str,
     group.update_attributes({**stated, _SEAL: _digest(_without_seal(stated))})
 
 
-def read_manifest(group: zarr.Group) -> list[ManifestRow]:
-    """Manifest rows of a group, empty where there is no manifest yet."""
-    return [ManifestRow.from_json(row) for row in _content(group).get("shards", [])]
+@dataclass(frozen=True)
+class Manifest:
+    """What a dataset was when it was committed: its shards, and the sha256 of every other object by its path."""
+
+    shards: list[ManifestRow] = field(default_factory=list)
+    objects: dict[str, str] = field(default_factory=dict)
+
+
+_PARSED = TypeAdapter(Manifest)
+
+
+def read_manifest(group: zarr.Group) -> Manifest | None:
+    """The manifest that the root's attributes name, None where there is none or another.
+
+    Raises
+    ------
+    UnsafeFileError
+        It names what is no object of a dataset.
+    """
+    try:
+        content = parse_json(read_bytes(group, _MANIFEST) or b"")["attributes"]
+        if attributes_of(group).get("manifest_sha256") != _digest(content):
+            return None
+        manifest = _PARSED.validate_python(content)
+    except (ValueError, TypeError, KeyError, RecursionError, OSError, UnsafeFileError):
+        return None
+    for path in (*manifest.objects, *(row.path for row in manifest.shards)):
+        require_member(path)
+    return manifest
+
+
+def covers(manifest: Manifest, grid: Grid) -> bool:
+    """Whether a manifest lists the shards of a grid and no others; none are listed where their number differs."""
+    if len(manifest.shards) != grid.shard_count:
+        return False
+    rows = {shard_path(shard): shard.rows for shard in grid.shards()}
+    return {row.path: row.rows for row in manifest.shards} == rows
 
 
 def is_sealed(group: zarr.Group) -> bool:
@@ -40,30 +87,23 @@ def is_sealed(group: zarr.Group) -> bool:
     return attributes.get(_SEAL) == _digest(_without_seal(attributes))
 
 
-def manifest_is_the_committed_one(group: zarr.Group) -> bool:
-    """Whether the manifest is the one that the root's attributes name."""
-    return attributes_of(group).get("manifest_sha256") == _digest(_content(group))
-
-
-def changed_objects(group: zarr.Group) -> Iterator[tuple[str, str]]:
+def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str, str]]:
     """Objects beside the shards that are not as they were written: path, and what is wrong."""
-    for path, digest in _content(group).get("objects", {}).items():
-        content = read_bytes(group, path)
+    for path, digest in manifest.objects.items():
+        try:
+            content = read_bytes(group, path)
+        except (OSError, UnsafeFileError) as error:
+            yield path, f"cannot be read ({reason_of(error)})"
+            continue
         if content is None:
             yield path, "missing"
         elif _sha256(content) != digest:
             yield path, "its sha256 is not the manifest's"
 
 
-def _content(group: zarr.Group) -> dict[str, Any]:
-    try:
-        return dict(json.loads(read_bytes(group, _MANIFEST) or b"{}").get("attributes", {}))
-    except ValueError:
-        return {}
-
-
 def _small_objects(group: zarr.Group) -> list[str]:
-    return [path for path in list_objects(group) if path not in (_ROOT, _MANIFEST) and "/vertices/c/" not in path]
+    paths = (path for path in list_objects(group) if is_member(path) and "/vertices/c/" not in path)
+    return [path for path in paths if path not in (_ROOT, _MANIFEST)]
 
 
 def _without_seal(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,16 @@ import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import ByteRequest, RangeByteRequest, SuffixByteRequest
 
-from datagen.errors import DatasetError
+from datagen.errors import DatasetError, UnsafeFileError, reason_of
 from datagen.grid import Grid, PoseType, Split
 from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
-from datagen.store.codec import ShardCodec, ShardDamage
-from datagen.store.manifest import is_sealed, manifest_is_the_committed_one, read_manifest
+from datagen.store.arrays import ArrayDamage, read_array, read_topology, read_vertex_count
+from datagen.store.codec import ShardCodec, ShardDamage, require_plausible
+from datagen.store.manifest import Manifest, covers, is_sealed, read_manifest
+from datagen.store.root_attributes import attributes_fault
 from datagen.store.schema import (
     ManifestRow,
-    array_at,
     attributes_of,
     check_version,
     codec_of,
@@ -62,10 +64,19 @@ class Dataset:
         """Identity of the content: equal for two datasets made from one recipe and one set of assets."""
         return str(self.attributes["uuid"])
 
-    @property
+    @cached_property
     def manifest(self) -> list[ManifestRow]:
         """One row a shard, ordered by path."""
+        return self.committed.shards if self.committed else []
+
+    @cached_property
+    def committed(self) -> Manifest | None:
+        """What the dataset was when it was committed; None where its manifest is damaged."""
         return read_manifest(self.group)
+
+    @cached_property
+    def _sizes(self) -> dict[str, int]:
+        return {row.path: row.bytes for row in self.manifest}
 
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
@@ -73,35 +84,55 @@ class Dataset:
 
     def faces(self, identity: int) -> NDArray[np.int32]:
         """Triangles [face, 3] of an identity."""
-        return self._faces_of(str(self._attribute(f"identity/{identity_name(identity)}", "topology")))
+        with self._damage():
+            topology, vertices = read_topology(self.group, identity), self.vertex_count(identity)
+            if (topology, vertices) not in self._topologies:
+                self._topologies[topology, vertices] = self._faces_of(topology, vertices)
+        return self._topologies[topology, vertices]
 
-    def _faces_of(self, topology: str) -> NDArray[np.int32]:
-        if topology not in self._topologies:
-            self._topologies[topology] = self._small(f"topology/{topology}/faces")
-        return self._topologies[topology]
+    def _faces_of(self, topology: str, vertices: int) -> NDArray[np.int32]:
+        path = f"topology/{topology}/faces"
+        faces = self._small(path, "int32", (None, 3))
+        if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
+            raise ArrayDamage(f"{path}/c/0/0", f"a face of other vertices than the {vertices} that there are")
+        return faces
 
     def parameters(self, identity: int) -> NDArray[np.float64]:
         """Body-model parameters [parameter] of an identity."""
-        return self._small(f"identity/{identity_name(identity)}/parameters")
+        count = len(self.attributes["body"]["parameters"])
+        with self._damage():
+            return self._small(f"identity/{identity_name(identity)}/parameters", "float64", (count,))
 
     def poses(self) -> Poses:
         """The poses of the whole dataset, over its named joints."""
         joints, parents = self.attributes["joints"], self.attributes["joint_parents"]
-        return Poses(tuple(joints), tuple(parents), self._small("pose/parameters"))
+        with self._damage():
+            rotations = self._small("pose/parameters", "float64", (self.grid.pose_count, len(joints), 3))
+        return Poses(tuple(joints), tuple(parents), rotations)
 
     def vertex_count(self, identity: int) -> int:
         """Vertices of an identity's meshes."""
         if identity not in self._counts:
-            with self._metadata_of(vertices_path(identity)):
-                self._counts[identity] = int(array_at(self.group, vertices_path(identity)).shape[1])
+            with self._damage():
+                self._counts[identity] = self._vertex_count(identity)
         return self._counts[identity]
+
+    def _vertex_count(self, identity: int) -> int:
+        rows, size = len(self.grid.rows_of(identity)), self.grid.rows_per_shard(self.grid.split(identity))
+        count = read_vertex_count(self.group, identity, rows=rows, rows_per_shard=size)
+        first = f"{vertices_path(identity)}/c/0/0/0"
+        try:
+            require_plausible(12 * count * min(rows, size), stored=self._sizes.get(first, 0))
+        except ShardDamage as error:
+            raise ArrayDamage(f"{vertices_path(identity)}/zarr.json", f"meshes of {count} vertices: {error}") from error
+        return count
 
     @cached_property
     def _counts(self) -> dict[int, int]:
         return {}
 
     @cached_property
-    def _topologies(self) -> dict[str, NDArray[np.int32]]:
+    def _topologies(self) -> dict[tuple[str, int], NDArray[np.int32]]:
         return {}
 
     def vertices(self, identity: int, poses: int | Sequence[int] | NDArray[np.integer] | None = None) -> Meshes:
@@ -145,31 +176,34 @@ class Dataset:
 
     def _bytes(self, path: str, byte_range: ByteRequest | None = None) -> bytes:
         try:
-            found = read_bytes(self.group, path, byte_range=byte_range)
-        except (OSError, ValueError) as error:
-            raise DatasetError(f"{self.url}: shard {path} cannot be read ({error}). {self._mend}") from error
+            found = read_bytes(self.group, path, limit=self._sizes.get(path, 0), byte_range=byte_range)
+        except (OSError, UnsafeFileError) as error:
+            raise DatasetError(f"{self.url}: shard {path} cannot be read ({reason_of(error)}). {self._mend}") from error
         if found is None:
             raise DatasetError(f"{self.url}: shard {path} is missing. {self._mend}")
         return found
 
-    def _small(self, path: str) -> NDArray[Any]:
-        with self._metadata_of(path):
-            return np.asarray(array_at(self.group, path)[...])
-
-    def _attribute(self, path: str, name: str) -> Any:
-        with self._metadata_of(path):
-            return self.group[path].attrs[name]
+    def _small(self, path: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+        return read_array(self.group, path, dtype, shape, objects=self.committed.objects if self.committed else ())
 
     @contextmanager
-    def _metadata_of(self, path: str) -> Iterator[None]:
+    def _damage(self) -> Iterator[None]:
         try:
             yield
-        except (KeyError, RuntimeError, ValueError, TypeError, OSError) as error:
-            raise DatasetError(f"{self.url}: {path} is missing or damaged ({error}). {self._mend}") from error
+        except ArrayDamage as error:
+            raise DatasetError(
+                f"{self.url}: {error.path} is missing or damaged ({error.reason}). {self._mend}"
+            ) from error
 
     def evaluation_triples(self, pose_type: PoseType) -> NDArray[np.int32]:
         """Rows of (source identity, source pose, target identity, target pose); truth = (target, source pose)."""
-        return self._small(f"evaluation/{pose_type}")
+        path = f"evaluation/{pose_type}"
+        most = [self.grid.identity_count, self.grid.pose_count] * 2
+        with self._damage():
+            triples = self._small(path, "int32", (None, 4))
+            if triples.size and not ((triples >= 0) & (triples < most)).all():
+                raise ArrayDamage(f"{path}/c/0/0", "a triple of identities or poses that are not there")
+        return triples
 
     @property
     def _mend(self) -> str:
@@ -194,20 +228,26 @@ def open_dataset(url: str) -> Dataset:
             f"{url} is incomplete (status {status!r}). Finish it: run the command that made it again, "
             f"or dsffnet verify {url} --repair"
         )
-    faults = list(_quick_faults(group, read_manifest(group)))
+    dataset = Dataset(url, group)
+    faults = list(islice(_quick_faults(dataset), 1000))
     if faults:
         more = f" and {len(faults) - 1} more" if len(faults) > 1 else ""
         raise DatasetError(f"{url}: {faults[0]}{more}. Mend it: dsffnet verify {url} --repair")
-    return Dataset(url, group)
+    return dataset
 
 
-def _quick_faults(group: zarr.Group, manifest: list[ManifestRow]) -> Iterator[str]:
-    if not is_sealed(group):
+def _quick_faults(dataset: Dataset) -> Iterator[str]:
+    if not is_sealed(dataset.group):
         yield "its attributes (zarr.json) are not as they were written"
-    if not manifest_is_the_committed_one(group):
+    fault = attributes_fault(dataset.group)
+    if fault:
+        yield fault
+    if dataset.committed is None:
         yield "its manifest is not the one that was committed"
-    sizes = stored_sizes(group, [row.path for row in manifest])
-    for row in manifest:
+    elif not covers(dataset.committed, dataset.grid):
+        yield "its manifest does not list the shards that its recipe has"
+    sizes = stored_sizes(dataset.group, [row.path for row in dataset.manifest])
+    for row in dataset.manifest:
         if row.path not in sizes:
             yield f"shard {row.path} is missing"
         elif sizes[row.path] != row.bytes:

@@ -10,12 +10,9 @@ NAME.zarr                     status building|complete, recipe, splits, provenan
   manifest                    one row a shard: path, rows, sha256 (attributes); committed last
 """
 
-import asyncio
-import contextlib
-import os
-from collections.abc import Iterator
+import json
 from dataclasses import asdict, dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import zarr
@@ -26,12 +23,19 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 from zarr.errors import ContainsGroupError
 
-from datagen.errors import DatasetError, StorageError
+from datagen.errors import DatasetError, DsffnetError, reason_of
 from datagen.grid import Grid, Shard, Split
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardCodec
+from datagen.store.objects import LONGEST_LIST, Objects, is_leftover, is_member, open_objects
 
 FORMAT_VERSION = 2
+_MOST_POSES = 1_000_000
+"""They are one array, which is read and written whole."""
+_MOST_TRIPLES = 10_000_000
+_MOST_STEPS = 1000
+_BYTES_OF_IDENTITY, _BYTES_OF_SHARD = 700, 500
+"""Of the manifest, no less than it takes."""
 
 
 class NoDataset(DatasetError):
@@ -51,10 +55,6 @@ class ManifestRow:
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
-
-    @classmethod
-    def from_json(cls, row: dict[str, Any]) -> "ManifestRow":
-        return cls(**{**row, "minimum": tuple(row["minimum"]), "maximum": tuple(row["maximum"])})
 
 
 def identity_name(identity: int) -> str:
@@ -98,22 +98,6 @@ def codec_of(recipe: DatasetRecipe, split: Split, *, vertices: int) -> ShardCode
     return ShardCodec(Grid(recipe).rows_per_shard(split), vertices, store.codec, store.compression_level)
 
 
-def array_at(group: zarr.Group, path: str) -> zarr.Array[Any]:
-    """The array at ``path``; KeyError where there is none."""
-    found = group[path]
-    if not isinstance(found, zarr.Array):
-        raise KeyError(path)
-    return found
-
-
-def stored_vertex_count(group: zarr.Group, identity: int) -> int | None:
-    """Vertices of an identity's meshes; None where its array has no metadata that can be read."""
-    try:
-        return int(array_at(group, vertices_path(identity)).shape[1])
-    except (KeyError, RuntimeError, ValueError, TypeError, OSError):
-        return None
-
-
 def attributes_of(group: zarr.Group) -> dict[str, Any]:
     """Attributes of a group as a plain dictionary."""
     return dict(group.attrs.asdict())
@@ -131,65 +115,93 @@ def stored_recipe(url: str, group: zarr.Group) -> DatasetRecipe:
     if stored is None:
         raise DatasetError(f"{url} holds no recipe. Make it anew: dsffnet generate --recipe RECIPE --out {url} --fresh")
     try:
-        return DatasetRecipe.model_validate(stored)
+        recipe = DatasetRecipe.model_validate(stored)
     except ValidationError as error:
         raise DatasetError(
             f"{url} holds a recipe that this program does not understand ({error.error_count()} faults). "
             "Read it with the version that made it, or make it anew with --fresh"
         ) from error
+    check_extent(url, recipe)
+    return recipe
 
 
-def read_bytes(group: zarr.Group, path: str, *, byte_range: ByteRequest | None = None) -> bytes | None:
-    """Bytes of one object of the dataset's store, all or a range of them; None where there is none."""
-    found = sync(group.store.get(_key(group, path), default_buffer_prototype(), byte_range))
-    return None if found is None else found.to_bytes()
+def check_extent(url: str, recipe: DatasetRecipe) -> None:
+    """Refuse a recipe whose counts no dataset of this format can hold, before anything is listed.
+
+    Raises
+    ------
+    DatasetError
+        More identities and shards than a manifest can name, or too many poses, triples or steps.
+    """
+    grid, steps = Grid(recipe), len(recipe.growth) + 1
+    if steps > _MOST_STEPS:
+        raise DatasetError(f"{url}: its recipe has grown in {steps:,} steps; a dataset can grow in {_MOST_STEPS:,}")
+    manifest = _BYTES_OF_IDENTITY * grid.identity_count + _BYTES_OF_SHARD * grid.shard_count
+    triples = recipe.triples.count * steps
+    if manifest > LONGEST_LIST or grid.pose_count > _MOST_POSES or triples > _MOST_TRIPLES:
+        raise DatasetError(
+            f"{url}: its recipe has {grid.identity_count:,} identities, {grid.pose_count:,} poses, "
+            f"{grid.shard_count:,} shards and {triples:,} triples. A dataset holds up to {_MOST_POSES:,} poses, "
+            f"{LONGEST_LIST // _BYTES_OF_SHARD:,} shards and {_MOST_TRIPLES:,} triples; make shards larger "
+            "(data.store.poses_per_shard), or several datasets"
+        )
+
+
+def objects_of(group: zarr.Group) -> Objects:
+    """The store of a group that :func:`open_group` or :func:`create_group` gave."""
+    return cast(Objects, group.store)
+
+
+def read_bytes(
+    group: zarr.Group, path: str, *, limit: int | None = None, byte_range: ByteRequest | None = None
+) -> bytes | None:
+    """Bytes of one object of the dataset's store, all or a range of them; None where there is none.
+
+    Raises
+    ------
+    UnsafeFileError
+        No object of a dataset is called so, or what is there is not a regular file of at most ``limit`` bytes inside.
+    OSError
+        It cannot be read.
+    StorageError
+        A remote store does not answer.
+    """
+    return objects_of(group).read(path, limit=limit, byte_range=byte_range)
 
 
 def write_bytes(group: zarr.Group, path: str, content: bytes) -> None:
     """Write one object of the dataset's store whole, in the place of any that is there."""
-    sync(group.store.set(_key(group, path), default_buffer_prototype().buffer.from_bytes(content)))
+    sync(group.store.set(path, default_buffer_prototype().buffer.from_bytes(content)))
 
 
 def delete_object(group: zarr.Group, path: str) -> None:
     """Remove one object of the dataset's store, if it is there."""
-    sync(group.store.delete(_key(group, path)))
+    sync(group.store.delete(path))
 
 
 def list_objects(group: zarr.Group) -> list[str]:
-    """Paths of all objects of the dataset's store, sorted."""
-    prefix = f"{group.path}/" if group.path else ""
+    """Paths of all objects of the dataset's store, and of what killed writers left of some, sorted."""
 
     async def listed() -> list[str]:
-        return [key async for key in group.store.list_prefix(prefix)]
+        return [key async for key in group.store.list_prefix("")]
 
-    return sorted(key.removeprefix(prefix) for key in sync(listed()))
-
-
-def _key(group: zarr.Group, path: str) -> str:
-    return f"{group.path}/{path}" if group.path else path
+    return sorted(path for path in sync(listed()) if is_member(path) or is_leftover(path))
 
 
 def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
-    """Size in bytes of each path that exists, asked for concurrently."""
-
-    async def size(path: str) -> tuple[str, int] | None:
-        try:
-            return path, await group.store.getsize(_key(group, path))
-        except FileNotFoundError:
-            return None
-
-    async def sizes() -> list[tuple[str, int] | None]:
-        return list(await asyncio.gather(*(size(path) for path in paths)))
-
-    return dict(found for found in sync(sizes()) if found is not None)
+    """Size in bytes of each path that exists and is a file."""
+    return objects_of(group).sizes(paths)
 
 
-def plain(url: str) -> str:
-    """A store URL without ``file://``: such a dataset is a folder like any other."""
-    return url.removeprefix("file://")
+def parse_json(content: bytes) -> Any:
+    """Plain data from JSON (ValueError where it is none, or nested too deeply)."""
+    try:
+        return json.loads(content)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
-def open_group(url: str, *, mode: str = "r") -> zarr.Group:
+def open_group(url: str, *, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     """The root group of a dataset.
 
     Raises
@@ -202,17 +214,27 @@ def open_group(url: str, *, mode: str = "r") -> zarr.Group:
         The store cannot be reached.
     """
     try:
-        with storage_errors(url):
-            return zarr.open_group(plain(url), mode=mode, zarr_format=3)  # type: ignore[arg-type]
+        store = open_objects(url, read_only=mode == "r")
+        group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
+        attributes_of(group)
+        return group
+    except DsffnetError:
+        raise
     except FileNotFoundError as error:
+        if store.sizes(["zarr.json"]):  # what is there is neither group nor array
+            raise _unreadable(url, error) from error
         raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        raise DatasetError(
-            f"{url} is not a readable dataset: its zarr.json cannot be read ({error}). If it was one, make it again: "
-            f"dsffnet generate --recipe RECIPE --out {url} --fresh"
-        ) from error
+    except Exception as error:  # whatever Zarr comes to on metadata that is none
+        raise _unreadable(url, error) from error
+
+
+def _unreadable(url: str, error: Exception) -> DatasetError:
+    return DatasetError(
+        f"{url} is not a readable dataset: its zarr.json cannot be read ({reason_of(error)}). If it was one, make it "
+        f"again: dsffnet generate --recipe RECIPE --out {url} --fresh"
+    )
 
 
 def create_group(url: str, attributes: dict[str, Any]) -> zarr.Group:
@@ -223,12 +245,12 @@ def create_group(url: str, attributes: dict[str, Any]) -> zarr.Group:
     DatasetError
         There is something else at ``url``.
     """
-    strangers = [name for name in _names_at(url) if not name.startswith(".")]
+    store = open_objects(url, read_only=False)
+    strangers = [name for name in store.names() if not name.startswith(".")]
     if strangers and "zarr.json" not in strangers:
         raise DatasetError(f"{url} holds what is not a dataset ({strangers[0]}). Choose another --out")
     try:
-        with storage_errors(url):
-            return zarr.create_group(plain(url), attributes=attributes, zarr_format=3)
+        return zarr.create_group(store, attributes=attributes, zarr_format=3)
     except ContainsGroupError:  # on a store without a lock, somebody else was first
         return open_group(url, mode="r+")
 
@@ -239,35 +261,9 @@ def require_group(group: zarr.Group, path: str) -> zarr.Group:
         return group.require_group(path)
     except ContainsGroupError:  # made between Zarr's look and its making
         return cast(zarr.Group, group[path])
-
-
-def _names_at(url: str) -> list[str]:
-    """Names of what lies directly at a place."""
-    if "://" not in plain(url):
-        return sorted(os.listdir(plain(url))) if os.path.isdir(plain(url)) else []
-    from fsspec.core import url_to_fs
-
-    with storage_errors(url):
-        system, path = url_to_fs(url)
-        system.invalidate_cache()
-        try:
-            return sorted(str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in system.ls(path, detail=False))
-        except FileNotFoundError:
-            return []
-
-
-@contextlib.contextmanager
-def storage_errors(url: str) -> Iterator[None]:
-    """Turn what cloud clients raise (no credentials, no such address) into one error a person can act on."""
-    try:
-        yield
-    except Exception as error:
-        if type(error).__module__.split(".")[0] not in ("botocore", "aiobotocore", "gcsfs", "google", "azure"):
-            raise
-        raise StorageError(
-            f"{url} cannot be reached ({error}). Check its address and your credentials; for S3: AWS_ACCESS_KEY_ID, "
-            "AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL"
-        ) from error
+    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError):  # what is there is no group
+        delete_object(group, f"{path}/zarr.json")
+        return group.create_group(path)
 
 
 def check_ours(url: str, group: zarr.Group) -> None:
@@ -284,4 +280,4 @@ def check_version(url: str, group: zarr.Group) -> None:
         return
     newer = isinstance(found, int) and found > FORMAT_VERSION
     advice = "update the project" if newer else "make it again: dsffnet generate --recipe RECIPE --out NEW.zarr"
-    raise DatasetError(f"{url} has format version {found!r}, this program reads {FORMAT_VERSION}; {advice}")
+    raise DatasetError(f"{url} has format version {found!r:.20}, this program reads {FORMAT_VERSION}; {advice}")

@@ -3,17 +3,21 @@
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import zarr
 
+from datagen.errors import DatasetError, UnsafeFileError, reason_of
 from datagen.grid import POSE_TYPES, SPLITS, Grid, Shard
 from datagen.recipe import DatasetRecipe, MixedBody
-from datagen.store.manifest import changed_objects, is_sealed, manifest_is_the_committed_one, read_manifest
+from datagen.store.arrays import ArrayDamage, read_array
+from datagen.store.manifest import Manifest, changed_objects, covers, is_sealed, read_manifest
+from datagen.store.reader import Dataset
+from datagen.store.root_attributes import attributes_fault
 from datagen.store.schema import (
     ManifestRow,
-    array_at,
     attributes_of,
     check_version,
     open_group,
@@ -21,10 +25,8 @@ from datagen.store.schema import (
     shard_path,
     stored_recipe,
     stored_sizes,
-    stored_vertex_count,
-    vertices_path,
 )
-from datagen.store.writer import existing_shard
+from datagen.store.writer import existing_shard, stored_vertex_count
 
 Progress = Callable[[Iterable[Shard]], Iterable[Shard]]
 
@@ -44,51 +46,85 @@ def find_faults(url: str, *, progress: Progress = iter) -> Iterator[Fault]:
     Where a dataset is still being made there is no manifest; its shards are decoded instead.
     """
     group = open_group(url)
-    grid = Grid(require_recipe(url))
-    manifest = {row.path: row for row in read_manifest(group)}
+    grid, manifest = Grid(require_recipe(url)), read_manifest(group) or Manifest()
+    rows = {row.path: row for row in manifest.shards}
     for shard in progress(grid.shards()):
-        reason = _fault(url, grid.recipe, shard, manifest.get(shard_path(shard)))
+        reason = _fault(group, grid, shard, rows.get(shard_path(shard)))
         if reason:
             yield Fault(shard_path(shard), reason, shard)
-    yield from (Fault(path, reason) for path, reason in changed_objects(group))
+    changed = [Fault(path, reason) for path, reason in changed_objects(group, manifest)]
+    yield from changed
     if attributes_of(group).get("status") == "complete":
-        yield from _root_faults(group)
+        root = list(_root_faults(group, grid))
+        yield from root
+        if not changed and not root:
+            yield from _misfits(Dataset(url, group))
 
 
-def _root_faults(group: zarr.Group) -> Iterator[Fault]:
+def _root_faults(group: zarr.Group, grid: Grid) -> Iterator[Fault]:
     if not is_sealed(group):
         yield Fault("zarr.json", "its attributes are not as they were written")
-    if not manifest_is_the_committed_one(group):
+    elif reason := attributes_fault(group):
+        yield Fault("zarr.json", reason)
+    manifest = read_manifest(group)
+    if manifest is None or not covers(manifest, grid):
         yield Fault("manifest/zarr.json", "not the manifest that was committed")
 
 
-def _fault(url: str, recipe: DatasetRecipe, shard: Shard, row: ManifestRow | None) -> str | None:
+def _misfits(dataset: Dataset) -> Iterator[Fault]:
+    """Arrays that are as they were committed, and yet not as the format has them."""
+    identities = range(dataset.grid.identity_count)
+    reads = [
+        dataset.poses,
+        *(partial(dataset.evaluation_triples, pose_type) for pose_type in POSE_TYPES),
+        *(partial(read, identity) for identity in identities for read in (dataset.faces, dataset.parameters)),
+    ]
+    found = (_damage_of(read) for read in reads)
+    yield from dict.fromkeys(Fault(damage.path, damage.reason) for damage in found if damage)
+
+
+def _damage_of(read: Callable[[], Any]) -> ArrayDamage | None:
+    try:
+        read()
+    except DatasetError as error:
+        if isinstance(error.__cause__, ArrayDamage):
+            return error.__cause__
+        raise
+    return None
+
+
+def _fault(group: zarr.Group, grid: Grid, shard: Shard, row: ManifestRow | None) -> str | None:
     if row is None:
-        return None if existing_shard(url, recipe, shard) else "missing or damaged"
-    content = read_bytes(open_group(url), shard_path(shard))
+        return None if existing_shard(group, grid, shard) else "missing or damaged"
+    try:
+        content = read_bytes(group, row.path, limit=row.bytes)
+    except (OSError, UnsafeFileError) as error:
+        return f"cannot be read ({reason_of(error)})"
     if content is None:
         return "missing"
     if len(content) != row.bytes:
         return f"{len(content)} bytes instead of {row.bytes}"
     if hashlib.sha256(content).hexdigest() != row.sha256:
         return "its sha256 is not the manifest's"
-    metadata_is_lost = stored_vertex_count(open_group(url), shard.identity) is None  # a fault of its own
-    return None if metadata_is_lost or existing_shard(url, recipe, shard) else "cannot be decoded"
+    metadata_is_lost = stored_vertex_count(group, grid, shard.identity) is None  # a fault of its own
+    return None if metadata_is_lost or existing_shard(group, grid, shard) else "cannot be decoded"
 
 
 def describe(url: str) -> dict[str, Any]:
     """What a person wants to know of a dataset, at any status: grid, progress, sizes, provenance."""
     group = open_group(url)
     check_version(url, group)
-    attributes = attributes_of(group)
-    recipe = stored_recipe(url, group)
+    fault = attributes_fault(group)
+    if fault:
+        raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
+    attributes, recipe = attributes_of(group), stored_recipe(url, group)
     grid = Grid(recipe)
     shards = grid.shards()
     sizes = stored_sizes(group, [shard_path(shard) for shard in shards])
     facts = {
         "dataset": url,
-        "status": attributes.get("status", "unknown"),
-        "uuid": attributes.get("uuid", "unknown"),
+        "status": attributes["status"],
+        "uuid": attributes["uuid"],
         "body": f"{recipe.body.family} {_kind(recipe)}".strip(),
         "identities": ", ".join(f"{_count(grid.identities(split))} {split}" for split in SPLITS),
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
@@ -117,8 +153,10 @@ def _assets(assets: list[dict[str, str]]) -> str:
 
 
 def _triples(group: zarr.Group, pose_type: str) -> int:
-    path = f"evaluation/{pose_type}"
-    return int(array_at(group, path).shape[0]) if path in group else 0
+    try:
+        return len(read_array(group, f"evaluation/{pose_type}", "int32", (None, 4)))
+    except ArrayDamage:
+        return 0
 
 
 def _count(numbers: list[int]) -> str:
@@ -138,9 +176,9 @@ def _growth(recipe: DatasetRecipe) -> str:
 
 
 def _extent(attributes: dict[str, Any]) -> str:
-    found = attributes.get("statistics")
-    if not found:
+    if attributes["status"] != "complete":
         return ""
+    found = attributes["statistics"]
     sides = np.subtract(found["maximum"], found["minimum"])
     return " x ".join(f"{side:.2f}" for side in sides) + " m, all meshes together"
 
@@ -155,8 +193,8 @@ def _kind(recipe: DatasetRecipe) -> str:
 
 
 def _vertex_counts(group: zarr.Group, grid: Grid) -> str:
-    paths = [vertices_path(identity) for identity in range(grid.identity_count)]
-    counts = sorted({array_at(group, path).shape[1] for path in paths if path in group})
+    found = {stored_vertex_count(group, grid, identity) for identity in range(grid.identity_count)}
+    counts = sorted(count for count in found if count)
     if not counts:
         return "unknown"
     return f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,}"

@@ -6,8 +6,8 @@ missing, a shard is written once and whole by one task, and ``status: complete``
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import zarr
@@ -16,21 +16,22 @@ from zarr.codecs import ZstdCodec
 from zarr.errors import ContainsArrayError
 
 from datagen.bodies import BodyModel
-from datagen.errors import DatasetError, StorageError
+from datagen.errors import DatasetError, UnsafeFileError, storage_errors
 from datagen.grid import Grid, Shard
 from datagen.importers import evaluation_lists
 from datagen.mesh import bounds
 from datagen.poses import draw_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
+from datagen.store.arrays import ArrayDamage, read_array, read_vertex_count, read_vertices_shape
 from datagen.store.attributes import assets_of, check_same_assets, check_same_recipe, provenance, stated
-from datagen.store.codec import ShardDamage
-from datagen.store.manifest import commit, read_manifest
+from datagen.store.codec import ShardCodec, ShardDamage
+from datagen.store.manifest import Manifest, commit, read_manifest
 from datagen.store.schema import (
     ManifestRow,
     NoDataset,
-    array_at,
     attributes_of,
+    check_extent,
     codec_of,
     create_group,
     create_vertices_array,
@@ -41,9 +42,7 @@ from datagen.store.schema import (
     read_bytes,
     require_group,
     shard_path,
-    storage_errors,
     stored_sizes,
-    stored_vertex_count,
     vertices_path,
     write_bytes,
 )
@@ -65,6 +64,7 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
         A dataset of another recipe, other assets or another version is there already, or something else is.
     """
     with _writing(url):
+        check_extent(url, recipe)
         wanted = stated(recipe, body)
         try:
             group = open_group(url, mode="r+")
@@ -134,11 +134,12 @@ def write_shard(
         The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its array's
         shape; nothing is written then.
     """
-    path, group = shard_path(shard), require_driven(url, recipe)
-    expected = (shard.rows, array_at(group, vertices_path(shard.identity)).shape[1], 3)
-    if vertices.shape != expected:
-        raise DatasetError(f"{url}: shard {path} came out of shape {list(vertices.shape)} instead of {list(expected)}")
-    codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=vertices.shape[1])
+    path, group, grid = shard_path(shard), require_driven(url, recipe), Grid(recipe)
+    count = stored_vertex_count(group, grid, shard.identity)
+    if count is None or vertices.shape != (shard.rows, count, 3):
+        expected = [shard.rows, count, 3]
+        raise DatasetError(f"{url}: shard {path} came out of shape {list(vertices.shape)} instead of {expected}")
+    codec = codec_of(recipe, grid.split(shard.identity), vertices=count)
     content = codec.encode(vertices)
     row = _row(shard, content, vertices)
     if committed not in (None, row.sha256):
@@ -153,17 +154,25 @@ def write_shard(
     return row
 
 
-def existing_shard(url: str, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:
-    """The manifest row of a shard that is there, whole and sound; None where it is missing or damaged."""
-    group = open_group(url)
-    content = read_bytes(group, shard_path(shard))
-    count = stored_vertex_count(group, shard.identity)
-    if content is None or count is None:
+def existing_shard(group: zarr.Group, grid: Grid, shard: Shard) -> ManifestRow | None:
+    """The manifest row of a shard that is there, whole and sound; None where it is missing, damaged or unreadable."""
+    count = stored_vertex_count(group, grid, shard.identity)
+    if count is None:
         return None
+    codec = codec_of(grid.recipe, grid.split(shard.identity), vertices=count)
     try:
-        codec = codec_of(recipe, Grid(recipe).split(shard.identity), vertices=count)
-        return _row(shard, content, codec.decode(content, shard.rows))
-    except ShardDamage:
+        content = read_bytes(group, shard_path(shard), limit=codec.most_bytes)
+        return None if content is None else _row(shard, content, codec.decode(content, shard.rows))
+    except (ShardDamage, OSError, UnsafeFileError):
+        return None
+
+
+def stored_vertex_count(group: zarr.Group, grid: Grid, identity: int) -> int | None:
+    """Vertices of an identity's meshes; None where its array has no metadata that makes sense."""
+    size = grid.rows_per_shard(grid.split(identity))
+    try:
+        return read_vertex_count(group, identity, rows=None, rows_per_shard=size)
+    except ArrayDamage:
         return None
 
 
@@ -213,9 +222,10 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
 def committed_hashes(url: str) -> dict[str, str]:
     """The sha256 of each shard that a dataset's manifest has, by path; empty where there is none."""
     try:
-        return {row.path: row.sha256 for row in read_manifest(open_group(url))}
+        manifest = read_manifest(open_group(url)) or Manifest()
     except NoDataset:
         return {}
+    return {row.path: row.sha256 for row in manifest.shards}
 
 
 def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
@@ -244,45 +254,46 @@ def _create_identity(
     home, rows, path = f"identity/{identity_name(identity)}", grid.rows_of(identity), vertices_path(identity)
     _put(group, f"{home}/parameters", parameters, ("parameter",))
     _put(group, f"{home}/pose", rows.astype(np.int32), ("row",))
-    if path not in group:
-        codec = codec_of(grid.recipe, grid.split(identity), vertices=vertices)
+    codec = codec_of(grid.recipe, grid.split(identity), vertices=vertices)
+    if _vertices_shape(group, identity, codec) != (len(rows), vertices, 3):
+        delete_object(group, f"{path}/zarr.json")  # of an array that has grown, or a damaged one: no shard is touched
         with contextlib.suppress(ContainsArrayError):  # on a store without a lock, somebody else was first
             create_vertices_array(group, path, rows=len(rows), codec=codec)
-    elif array_at(group, path).shape[0] != len(rows):
-        array_at(group, path).resize((len(rows), vertices, 3))
     require_group(group, home).update_attributes({"topology": topology, "split": grid.split(identity)})
+
+
+def _vertices_shape(group: zarr.Group, identity: int, codec: ShardCodec) -> tuple[int, ...] | None:
+    try:
+        return read_vertices_shape(group, identity, rows_per_shard=codec.rows)
+    except ArrayDamage:
+        return None
 
 
 def _put(group: zarr.Group, path: str, values: NDArray[Any], dimensions: tuple[str, ...]) -> None:
     """Store a small array in one chunk with a checksum, unless it is there and holds these values already."""
     if _holds(group, path, values):
         return
-    array = group.create_array(
-        path,
-        shape=values.shape,
-        dtype=values.dtype,
-        chunks=tuple(max(1, size) for size in values.shape),
-        compressors=ZstdCodec(level=3, checksum=True),
-        dimension_names=dimensions,
-        overwrite=True,
-    )
-    array[...] = values
+    for name in ("zarr.json", "/".join(["c", *"0" * values.ndim])):
+        delete_object(group, f"{path}/{name}")
+    with contextlib.suppress(ContainsArrayError):  # on a store without a lock, somebody else was first
+        group.create_array(
+            path,
+            shape=values.shape,
+            dtype=values.dtype,
+            chunks=tuple(max(1, size) for size in values.shape),
+            compressors=ZstdCodec(level=3, checksum=True),
+            dimension_names=dimensions,
+        )
+    cast(zarr.Array[Any], group[path])[...] = values
 
 
 def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
     try:
-        return np.array_equal(np.asarray(array_at(group, path)[...]), values)
-    except (KeyError, RuntimeError, ValueError, OSError):
+        return np.array_equal(read_array(group, path, values.dtype.name, values.shape), values)
+    except ArrayDamage:
         return False
 
 
-@contextlib.contextmanager
-def _writing(url: str) -> Iterator[None]:
-    try:
-        with storage_errors(url):
-            yield
-    except OSError as error:
-        raise StorageError(
-            f"could not write to {url}: {error.strerror or error}. What was complete is untouched; "
-            "make room or choose another --out, then run the same command again"
-        ) from error
+def _writing(url: str) -> contextlib.AbstractContextManager[None]:
+    advice = "What was complete is untouched; make room or choose another --out, then run the same command again"
+    return storage_errors(f"to {url}", advice=advice)
