@@ -23,13 +23,12 @@ from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
 from datagen.bodies.skinning import joint_transforms
-from datagen.generate import ensure_shard, prepare
+from datagen.generate import ensure_shard, generate, prepare
 from datagen.grid import Grid, Shard
 from datagen.poses import draw_poses
 from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
-from datagen.store.reader import Dataset
-from datagen.store.schema import open_group, shard_path
+from datagen.store.schema import shard_path
 
 POSES, IDENTITIES, ROUNDS, ONE_AT_A_TIME = 100, 7, 7, 10
 
@@ -122,7 +121,7 @@ def measure(topology: str, folder: Path) -> None:
 
 def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) -> None:
     """Speed of reading whole shards and single meshes (decoded bytes, from the page cache), and the size."""
-    dataset, count = Dataset(url, open_group(url)), len(shards)
+    dataset, count = generate(recipe, url), len(shards)
     began = time.perf_counter()
     size = sum(dataset.vertices(identity).nbytes for identity in range(count))
     whole = size / (time.perf_counter() - began) / 1e6

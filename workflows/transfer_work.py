@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import StorageError
+from datagen.errors import storage_errors
 from datagen.mesh import Mesh
 from datagen.mesh_files import MeshFile, write_posed
 from datagen.mesh_glb_written import FRAME_LIMIT
@@ -163,12 +163,10 @@ def _appearing_whole(out: Path, *, own: set[str]) -> Iterator[Path]:
 
     Those of ``own`` take the place of an earlier run's; materials and textures leave other files of their name alone.
     """
-    try:
+    with storage_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             yield Path(folder)
             for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
                 name = path.relative_to(folder)
                 _move(path, out / name, is_own=str(name) in own)
-    except OSError as error:
-        raise StorageError(f"could not write {out}: {error.strerror or error}") from error

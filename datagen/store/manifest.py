@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from datagen.errors import UnsafeFileError, reason_of
 from datagen.grid import Grid
-from datagen.store.objects import is_member, require_member
+from datagen.store.object_names import is_member, require_member
 from datagen.store.schema import (
     ManifestRow,
     attributes_of,

@@ -27,7 +27,8 @@ from datagen.errors import DatasetError, DsffnetError, reason_of
 from datagen.grid import Grid, Shard, Split
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardCodec
-from datagen.store.objects import LONGEST_LIST, Objects, is_leftover, is_member, open_objects
+from datagen.store.object_names import LONGEST_LIST, is_leftover, is_member
+from datagen.store.objects import Objects, open_objects
 
 FORMAT_VERSION = 2
 _MOST_POSES = 1_000_000

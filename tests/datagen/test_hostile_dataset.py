@@ -4,8 +4,8 @@ mended is mended."""
 import contextlib
 import errno
 import os
-import shutil
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from numcodecs import Zstd
 from datagen.errors import DatasetError, DsffnetError, StorageError
 from datagen.generate import append, generate, repair
 from datagen.store import open_dataset
-from datagen.store.objects import LocalObjects, is_member
+from datagen.store.object_names import is_member
+from datagen.store.objects import LocalObjects
 from datagen.store.verify import describe, find_faults, require_recipe
 from tests.support.files import tree_hash
 from tests.support.hostile import edit, sealed

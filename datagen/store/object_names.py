@@ -1,0 +1,62 @@
+"""The objects that a dataset can have: their paths, and how long each can be."""
+
+import re
+
+from zarr.core.buffer import Buffer
+
+from datagen.errors import DatasetError, UnsafeFileError
+from datagen.store.codec import LARGEST_CHUNK
+
+_NUMBER = "[0-9]{1,9}"
+_MEMBER = re.compile(
+    rf"""(?:(?:topology|identity|pose|evaluation|manifest)/)?zarr\.json
+    |topology/{_NUMBER}/(?:faces/)?zarr\.json|topology/{_NUMBER}/faces/c/0/0
+    |identity/{_NUMBER}/(?:(?:vertices|pose|parameters)/)?zarr\.json
+    |identity/{_NUMBER}/(?:vertices/c/{_NUMBER}/0/0|(?:pose|parameters)/c/0)
+    |pose/parameters/(?:zarr\.json|c/0/0/0)
+    |evaluation/(?:seen|unseen)/(?:zarr\.json|c/0/0)""",
+    re.VERBOSE,
+)
+_LEFTOVER = re.compile(r"(?:[a-z0-9]+/)*[a-z0-9]+\.[0-9a-f]+\.partial")
+"""What a killed writer leaves of an object."""
+LONGEST_LIST = 2**27
+"""Bytes of zarr.json and manifest/zarr.json, which grow with the dataset."""
+_LONGEST_METADATA = 2**20
+_LONGEST_ARRAY = LARGEST_CHUNK + 2**24
+
+
+def is_member(path: str) -> bool:
+    """Whether a path is one that an object of a dataset can have."""
+    return _MEMBER.fullmatch(path) is not None
+
+
+def require_member(path: str) -> None:
+    """Refuse a path that no object of a dataset has.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is not of the layout: absolute, with "..", or just something else.
+    """
+    if not is_member(path):
+        raise UnsafeFileError(f"the dataset names {path[:200]!r}, none of its objects. Do not trust what it holds")
+
+
+def is_leftover(path: str) -> bool:
+    """Whether a path is that of a file that a killed writer left behind."""
+    return _LEFTOVER.fullmatch(path) is not None
+
+
+def limit_of(path: str) -> int:
+    """The most bytes that an object can have, where nothing more is known of it."""
+    if path in ("zarr.json", "manifest/zarr.json"):
+        return LONGEST_LIST
+    return _LONGEST_METADATA if path.endswith("zarr.json") else _LONGEST_ARRAY
+
+
+def require_short(path: str, content: Buffer) -> None:
+    if path.endswith("zarr.json") and len(content) > limit_of(path):
+        raise DatasetError(
+            f"{path} would have {len(content):,} bytes, more than the {limit_of(path):,} that readers take. Make "
+            "fewer and larger shards: data.store.poses_per_shard"
+        )
