@@ -22,6 +22,16 @@ def dataset(_pristine: Path) -> str:
     return str(_pristine)
 
 
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An MLflow database with its tables, which take seconds to make."""
+    import mlflow
+
+    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
+    mlflow.MlflowClient(f"sqlite:///{path}").search_experiments()
+    return path
+
+
 @pytest.fixture
 def spoilable(_pristine: Path, tmp_path: Path) -> Path:
     """A copy of the small dataset that a test may damage."""

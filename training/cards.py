@@ -1,5 +1,6 @@
 """Cards: what a dataset and a trained model are, what they are for, and where they end. Parts of a report."""
 
+import shlex
 from pathlib import Path
 
 from datagen.store import Dataset
@@ -32,7 +33,7 @@ def dataset_card(dataset: Dataset, *, picture: Path | None = None) -> Section:
     body += [
         _assets(dataset, [text.source for text in texts]),
         Text(f"### Intended use\n\n{DATASET_USE}\n\n### Limits\n\n{limits}\n\n### To make it again"),
-        Code(f"dsffnet generate --recipe {name} --out AGAIN.zarr\ndsffnet verify AGAIN.zarr"),
+        Code(f"dsffnet generate --recipe {shlex.quote(name)} --out AGAIN.zarr\ndsffnet verify AGAIN.zarr"),
         Code(as_yaml({"data": recipe.identifying()}), folded="Its recipe (paths of asset files left out)"),
     ]
     return Section("Dataset card", tuple(body))

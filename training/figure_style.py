@@ -4,6 +4,9 @@ import os
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from datagen.printable import printable_lines
 
 DPI = 200
 INK, QUIET, RULE = "#1d2430", "#6b7483", "#e3e6ea"
@@ -15,6 +18,8 @@ def saved(figure: Figure, path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    for text in figure.findobj(Text):
+        text.set_text(printable_lines(text.get_text()))
     try:
         figure.savefig(temporary, format="png", dpi=DPI)
         os.replace(temporary, path)

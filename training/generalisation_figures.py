@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -79,8 +80,9 @@ def _draw_grid(axes: Axes, grid: NDArray[np.float64], kinds: Sequence[str], norm
         words = "–" if not np.isfinite(value) else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
         axes.text(column, line, words, ha="center", va="center", fontsize=7, color="white" if dark else INK)
     axes.axhline(len(kinds) - 0.5, color=PAGE, linewidth=3)
-    axes.set_xticks(range(len(kinds)), [_broken(kind) for kind in kinds], fontsize=6.5)
-    axes.set_yticks(range(len(kinds) + 1), [*map(_broken, kinds), _broken(NO_OP)], fontsize=6.5)
+    style: dict[str, Any] = {"fontsize": 6.5, "parse_math": False}  # kinds are called after folders
+    axes.set_xticks(range(len(kinds)), [_broken(kind) for kind in kinds], **style)
+    axes.set_yticks(range(len(kinds) + 1), [*map(_broken, kinds), _broken(NO_OP)], **style)
     axes.tick_params(length=0, colors=INK)
     for spine in axes.spines.values():
         spine.set_visible(False)

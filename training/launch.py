@@ -18,6 +18,7 @@ from typing import Any
 
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
+from datagen.printable import printable
 from training.ranks import STOP_FILE, Ranks, TrainingError, TrainingStopped, device_of
 from training.recipe import TrainingRecipe
 from training.recipe_file import recipe_in
@@ -221,7 +222,7 @@ def main() -> None:
     try:
         train(recipe_in(Path(recipe_path), words), data=data, run=Path(run))
     except (DsffnetError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         status = getattr(error, "exit_status", 1)
     sys.stdout.flush()
     sys.stderr.flush()

@@ -23,6 +23,7 @@ from datagen.errors import DsffnetError, MeshError, RecipeError
 from datagen.mesh import Mesh, check_mesh
 from datagen.mesh_files import read_mesh_file
 from training.alignment import Axes, axes_of_both, orientation
+from training.tracking_store import prepare_store, sqlite_file, sqlite_server
 from training.transfer import PoseTransfer
 
 _BAR = "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR"
@@ -95,10 +96,12 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
     RegistryError
         There is no such model there, it is none of this project's, or the server cannot be reached.
     """
-    store = Path(tracking_uri.removeprefix("sqlite:///"))
-    if tracking_uri.startswith("sqlite:///") and not store.is_file():  # MLflow would make one, of an empty registry
-        raise RegistryError(f"{uri} cannot be had: there is no MLflow store {store}; check --tracking-uri")
+    database = sqlite_file(tracking_uri)
+    if database and not database.is_file():  # MLflow would make one, of an empty registry
+        raise RegistryError(f"{uri} cannot be had: there is no MLflow store {database}; check --tracking-uri")
     try:
+        if database:
+            prepare_store(sqlite_server(database))
         with _server(tracking_uri):
             found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder)))
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage

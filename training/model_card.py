@@ -1,6 +1,8 @@
 """The card of a trained model: what its weights are, how they came about, what they score, where they end."""
 
 import hashlib
+import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -165,14 +167,14 @@ def _usage(home: Path) -> str:
     run = shown(home)
     return f"""\
 # on the command line
-dsffnet transfer --model {run} --source pose.obj --target person.glb --out posed.glb
+dsffnet transfer --model {shlex.quote(run)} --source pose.obj --target person.glb --out posed.glb
 
 # in Python
 from pathlib import Path
 from datagen.mesh_files import read_mesh_file, write_posed
 from training.transfer import PoseTransfer
 source, target = read_mesh_file("pose.obj"), read_mesh_file("person.glb")
-posed = PoseTransfer.from_run("{run}")(source=source.mesh, target=target.mesh)
+posed = PoseTransfer.from_run({json.dumps(run, ensure_ascii=False)})(source=source.mesh, target=target.mesh)
 write_posed(target, posed.vertices, Path("posed.glb"))
 
 # from the registry, where MLflow has it

@@ -10,8 +10,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from datagen.printable import printable_lines
 from training.figure_style import DPI, INK, PAGE, RULE
 from training.palette import ERROR_MAP
+
+_SMALLEST = 4.0  # points of a letter that can still be read
+_TOLERANCE = 2.0  # how far beyond their room such words may reach; longer ones are cut
 
 
 class Page:
@@ -32,9 +36,14 @@ class Page:
     def text(
         self, x: float, y: float, words: str, *, size: float, anchor: str = "left", room: float = np.inf, **style: Any
     ) -> None:
-        """Write words, in smaller letters where `room` pixels are too few; y is their middle, or what `va` says."""
+        """Write words, in smaller letters where `room` pixels are too few, cut where they still are; y is their middle,
+        or what `va` says.
+        """
+        words = printable_lines(words)
         per_letter = (0.68 if style.get("weight") == "bold" else 0.6) * DPI / 72  # of a point, in this font
-        size = min(size, max(room / (per_letter * max(len(words), 1)), 4.0))
+        size = min(size, max(room / (per_letter * max(len(words), 1)), _SMALLEST))
+        if per_letter * size * len(words) > room * _TOLERANCE:
+            words = f"{words[: int(room / (per_letter * size)) - 1]}…"
         style = {"color": INK, "parse_math": False, "va": "center", **style}  # names may hold dollar signs
         where = x / self.width, 1 - y / self.height
         self.figure.text(*where, words, fontsize=size, ha=anchor, **style)

@@ -87,8 +87,9 @@ class Progress:
         if past:
             return
         if self._before is not None and row["step"] > self._before["step"]:
-            evaluated = any(key.startswith("evaluation/") for key in row)
-            self._intervals.append((row["time"] - self._before["time"], row["step"] - self._before["step"], evaluated))
+            seconds, evaluated = row["time"] - self._before["time"], any(key.startswith("evaluation/") for key in row)
+            if seconds >= 0:  # else the clock was put back meanwhile
+                self._intervals.append((seconds, row["step"] - self._before["step"], evaluated))
         self._before = row
 
     def seconds_left(self) -> float | None:

@@ -202,14 +202,16 @@ def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
 
 
 def forget_old_stop(run: Path, ranks: Ranks, *, before: float) -> None:
-    """Rank 0 removes a RUN/stop that is older than this training; ``before`` in seconds since the epoch.
+    """Rank 0 removes a RUN/stop that is older than this training, or than a clock that was put back.
+
+    ``before`` is in seconds since the epoch.
 
     Not for a launcher that keeps the file itself: there it may be meant for ranks that were not up yet.
     """
 
     def remove() -> None:
         with contextlib.suppress(FileNotFoundError):
-            if (run / STOP_FILE).stat().st_mtime < before:
+            if not before <= (run / STOP_FILE).stat().st_mtime <= time.time():
                 (run / STOP_FILE).unlink()
 
     decided_by_first(ranks, remove)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from datagen.mesh import write_atomically
+from datagen.printable import printable_lines
 from datagen.store import Dataset, open_dataset
 from training.card_texts import NETWORKS, span, vertex_counts
 from training.cards import dataset_card, model_card
@@ -97,8 +98,8 @@ def write_report(
         It could not be written.
     """
     texts = {
-        folder / f"{name}.html": report_html(folder, title=title, lead=lead, sections=sections),
-        folder / f"{name}.md": report_markdown(folder, title=title, lead=lead, sections=sections),
+        folder / f"{name}.html": printable_lines(report_html(folder, title=title, lead=lead, sections=sections)),
+        folder / f"{name}.md": printable_lines(report_markdown(folder, title=title, lead=lead, sections=sections)),
     }
     for path, text in texts.items():
         write_atomically(path, text.encode())
@@ -219,7 +220,7 @@ def _lead(out: Path, dataset: Dataset, rows: list[Row]) -> str:
         f"{len(grid.poses('seen')):,} poses. "
     )
     scores = {each: mean_of(rows, method=each, pose_type=kind, field="pmd") * 1e4 for each in methods_of(rows)}
-    others = ", ".join(f"{each} {score:.2f}" for each, score in scores.items() if each != method)
+    others = ", ".join(f"{plain(each)} {score:.2f}" for each, score in scores.items() if each != method)
     error = mean_of(rows, method=method, pose_type=kind, field="millimetres")
     return (
         f"{trained}On new identities in {kind} poses: **PMD {scores[method]:.2f} x 1e-4, mean error {error:.1f} mm**. "

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable
 from typing import Literal
 
+from datagen.printable import printable
 from training.report_blocks import Block, Table, Text
 
 _PUNCTUATION = r"!-/:-@\[-`{-~"
@@ -30,7 +31,7 @@ Kind = Literal["heading", "paragraph", "ul", "ol"]
 
 def plain(text: object) -> str:
     """Any text as markup that shows it as it is, on one line."""
-    return _SPECIAL.sub(lambda found: f"\\{found[0]}", " ".join(str(text).split()))
+    return _SPECIAL.sub(lambda found: f"\\{found[0]}", printable(" ".join(str(text).split())))
 
 
 def inline_html(markup: str) -> str:

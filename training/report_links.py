@@ -17,7 +17,7 @@ class Link:
 def link_to(path: Path, folder: Path) -> Link:
     """The link from a report in ``folder`` to a file."""
     relative = Path(os.path.relpath(path, folder)).as_posix()
-    return Link(relative, quote(relative))
+    return Link(relative, quote(os.fsencode(relative)))
 
 
 def shown(path: Path) -> str:

@@ -116,7 +116,13 @@ def _status(record: Record, out: Path) -> str:
             return "still running when this report was written"
         status, ended = "stages finished", max(stage.ended or 0 for stage in stages)
     assert ended is not None
-    return f"{status} {moment(ended)}, {duration((ended - record.started) / 1000)} after it began"
+    seconds = _between(record.started, ended)
+    return f"{status} {moment(ended)}" + ("" if seconds is None else f", {duration(seconds)} after it began")
+
+
+def _between(began: int, ended: int) -> float | None:
+    """Seconds between two times in milliseconds; None where the clock was put back meanwhile."""
+    return (ended - began) / 1000 if ended >= began else None
 
 
 def _shareable(command: str, out: Path) -> str:
@@ -176,7 +182,7 @@ def _seconds(record: Record, out: Path) -> float | None:
     with suppress(OSError, ValueError, KeyError):
         if mark.stat().st_mtime * 1000 >= record.ended:
             return float(json.loads(mark.read_text())["seconds"])
-    return (record.ended - record.started) / 1000
+    return _between(record.started, record.ended)
 
 
 def _version(package: str) -> str:

@@ -47,7 +47,9 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.suptitle(title, fontsize=9, weight="bold", color=INK, x=0.01, ha="left", parse_math=False)
     place = {"loc": "outside lower left", "ncols": 7, "frameon": False}
-    figure.legend(handles, names, fontsize=7.5, labelcolor=INK, **place)
+    legend = figure.legend(handles, names, fontsize=7.5, labelcolor=INK, **place)
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # methods are called after folders
     return saved(figure, path)
 
 

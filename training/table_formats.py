@@ -12,6 +12,10 @@ from html import escape
 
 import numpy as np
 
+from training.report_blocks import cell_of
+from training.report_inline import plain
+from training.row_files import inert
+
 Lines = list[list[str]]
 
 THEIRS = "paper"
@@ -37,6 +41,7 @@ _NO_OP = "unchanged"
 
 def markdown(lines: Lines) -> str:
     """A Markdown table, aligned so that it also reads well as plain text."""
+    lines = [[_safe(cell) for cell in line] for line in lines]
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     left = {0, 1}
     texts = [
@@ -47,6 +52,12 @@ def markdown(lines: Lines) -> str:
     ]
     rule = "|" + "|".join("-" * (w + 2) if i in left else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
     return "\n".join([texts[0], rule, *texts[1:]])
+
+
+def _safe(cell: str) -> str:
+    """A cell whose text, within the marks around the whole of it, is no Markdown."""
+    its = cell_of(cell)
+    return f"{its.stars}{plain(its.text)}{its.stars}"
 
 
 def emphasised(lines: Lines) -> Lines:
@@ -69,7 +80,7 @@ def html(lines: Lines, *, caption: str = "") -> str:
 def csv(lines: Lines) -> str:
     """The cells as CSV, as they are printed."""
     text = io.StringIO()
-    csv_module.writer(text, lineterminator="\n").writerows(lines)
+    csv_module.writer(text, lineterminator="\n").writerows([inert(cell) for cell in line] for line in lines)
     return text.getvalue()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from training import paper
 from training.inference_time import Inference
 from training.measuring import NO_OPS, POSE_TYPES
+from training.report_inline import plain
 from training.rows import Row
 from training.spread import BOOTSTRAP, differences, interval, spread_over, values_of
 from training.table_formats import STYLE, THEIRS, Lines, csv, emphasised, html, markdown
@@ -107,7 +108,7 @@ def spread(rows: Sequence[Row]) -> str:
     """One line: the 95 % interval of each method's mean PMD, on unseen poses where there are any."""
     pose_type = spread_over(rows)
     found = {method: _interval(_pmd(rows, method, pose_type)) for method in methods_of(rows)}
-    parts = [f"{method} {low_to_high}" for method, low_to_high in found.items() if low_to_high]
+    parts = [f"{plain(method)} {low_to_high}" for method, low_to_high in found.items() if low_to_high]
     return (
         f"PMD x1e-4 on {pose_type} poses, 95 % intervals of the mean ({BOOTSTRAP}): {'; '.join(parts)}."
         if parts

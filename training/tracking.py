@@ -10,6 +10,7 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import shlex
 import shutil
 import tempfile
@@ -23,8 +24,10 @@ from typing import Any
 from filelock import FileLock
 
 from datagen.errors import DsffnetError
+from datagen.printable import printable, printable_lines
 from training.outbox import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
 from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, read_record
+from training.tracking_store import prepare_store
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
@@ -35,7 +38,7 @@ os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
 log = logging.getLogger(__name__)
 _PARENT_TAG, _RECORD_TAG, _WEIGHTS_TAG = "mlflow.parentRunId", "dsffnet.record", "dsffnet.weights"
-_METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER = 900, 90, 5000
+_METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER, _LONGEST_NAME = 900, 90, 5000, 250
 _LOCK_SECONDS = 120.0  # to wait for another process that publishes the same record, such as a sync by hand
 _NO_ANSWER = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "DEADLINE_EXCEEDED", "REQUEST_LIMIT_EXCEEDED")
 
@@ -60,6 +63,7 @@ def publish(root: Path, server: Server) -> None:
         logging.getLogger(chatty).setLevel(logging.WARNING)
     failures: list[Exception] = []
     try:
+        prepare_store(server)
         mlflow.set_tracking_uri(server.uri)
         client = mlflow.MlflowClient(server.uri)
         for folder in find_records(root):
@@ -68,11 +72,15 @@ def publish(root: Path, server: Server) -> None:
         failures.append(error)
     if failures:
         log.debug("publishing %s failed", root, exc_info=failures[0])
-        reason = (str(failures[0]).splitlines() or [type(failures[0]).__name__])[0][:200]
+        reason = str(failures[0]) if isinstance(failures[0], DsffnetError) else _first_line(failures[0])
         raise TrackingError(
             f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
             f"{_how_to_sync(root, server)} sends what is missing"
         ) from failures[0]
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def _how_to_sync(root: Path, server: Server | None) -> str:
@@ -164,13 +172,14 @@ class _Publication:
             known = read_sent((self.folder / self.record.parent).resolve(), self.server.uri)
             if known:  # a run that was copied away from its workflow stands alone
                 tags[_PARENT_TAG] = known["run"]
-        self.client.create_run(experiment, start_time=self.record.started, run_name=self.record.name, tags=tags)
+        name = printable(self.record.name)[:_LONGEST_NAME]
+        self.client.create_run(experiment, start_time=self.record.started, run_name=name, tags=tags)
 
     def _send_parameters(self, there: Any) -> None:
         """Parameters that the server lacks; it lets none change, so what a resumed run has otherwise becomes a tag."""
         from mlflow.entities import Param, RunTag
 
-        given = {key: value[:_LONGEST_PARAMETER] for key, value in self.record.parameters.items()}
+        given = {_key(key): _value(value) for key, value in self.record.parameters.items()}
         new = [Param(key, value) for key, value in given.items() if key not in there.params]
         for start in range(0, len(new), _PARAMETERS_AT_ONCE):
             self.client.log_batch(self.sent["run"], params=new[start : start + _PARAMETERS_AT_ONCE])
@@ -182,7 +191,7 @@ class _Publication:
     def _send_tags(self) -> None:
         from mlflow.entities import RunTag
 
-        tags = [RunTag(key, value[:_LONGEST_PARAMETER]) for key, value in self.record.tags.items()]
+        tags = [RunTag(_key(key), _value(value)) for key, value in self.record.tags.items()]
         self.client.log_batch(self.sent["run"], tags=tags)
         self._note(tags=self.record.tags)
 
@@ -192,7 +201,9 @@ class _Publication:
         from mlflow.entities import DatasetInput, InputTag
 
         about = self.record.dataset or {}
-        dataset = MetaDataset(CodeDatasetSource(tags=about), name=about["name"], digest=about["manifest_sha256"][:36])
+        source = CodeDatasetSource(tags={key: printable(value) for key, value in about.items()})
+        name, digest = printable(about["name"])[:_LONGEST_NAME], about["manifest_sha256"][:36]
+        dataset = MetaDataset(source, name=name, digest=digest)
         context = InputTag("mlflow.data.context", self.record.kind)
         self.client.log_inputs(self.sent["run"], [DatasetInput(dataset._to_mlflow_entity(), [context])])
 
@@ -205,7 +216,7 @@ class _Publication:
             self._note()
         if self.record.metrics != self.sent.get("metrics", {}):
             moment = self.record.measured or self.record.started  # not now: sent twice, it must be the same point
-            points = [Metric(key, value, moment, 0) for key, value in self.record.metrics.items()]
+            points = [Metric(_key(key), value, moment, 0) for key, value in self.record.metrics.items()]
             self.client.log_batch(self.sent["run"], metrics=points)
             self._note(metrics=self.record.metrics)
 
@@ -213,7 +224,7 @@ class _Publication:
         from mlflow.entities import Metric
 
         points = [
-            Metric(key, float(value), int(row["time"] * 1000), row["step"])
+            Metric(_key(key), float(value), int(row["time"] * 1000), row["step"])
             for row in rows
             for key, value in row.items()
             if key not in ("time", "step")
@@ -293,7 +304,10 @@ class _Publication:
         if self.record.status == "RUNNING":
             self.client.update_run(self.sent["run"], status="RUNNING")
         else:
-            self.client.set_terminated(self.sent["run"], self.record.status, self.record.ended)
+            ended = self.record.ended and max(
+                self.record.ended, self.record.started
+            )  # the clock may have been put back
+            self.client.set_terminated(self.sent["run"], self.record.status, ended)
         self._note(status=self.record.status)
 
     def _once(self, key: str, send: Any) -> None:
@@ -319,6 +333,16 @@ def _quiet_run(run: str) -> Iterator[None]:
 
 
 _NO_CACHES = shutil.ignore_patterns("__pycache__", "*.pyc", "node_modules")
+
+
+def _key(name: str) -> str:
+    """A name of a metric, parameter or tag with what MLflow refuses in one replaced; folders may have given it."""
+    parts = re.sub(r"[^/\w.\- :]", "_", name)[:_LONGEST_NAME].split("/")
+    return "/".join(part for part in parts if part not in ("", ".", "..")) or "_"
+
+
+def _value(text: str) -> str:
+    return printable_lines(text)[:_LONGEST_PARAMETER]
 
 
 def _experiment(client: Any, server: Server) -> str:

@@ -115,7 +115,10 @@ class _Trainer:
         found: Checkpoint | None,
     ) -> None:
         self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
-        self.device, self._stop, self._began = device, stop, began
+        self.device, self._stop = device, stop
+        self._began = time.monotonic() - max(
+            time.time() - began, 0.0
+        )  # clocks are put back, and differ between machines
         self.order, self.last_step = order_of(recipe, dataset), last_step_of(recipe, dataset)
         start = None if found else weights_to_begin_from(recipe, ranks)
         self.learner = Learner(
@@ -214,7 +217,7 @@ class _Trainer:
 
     def _spent(self) -> bool:
         budget = self.recipe.budget
-        return budget is not None and time.time() - self._began > budget_seconds(budget)
+        return budget is not None and time.monotonic() - self._began > budget_seconds(budget)
 
     def _log(self, values: dict[str, Any], probing: bool) -> None:
         shared = mean_over_ranks(values, self.ranks)

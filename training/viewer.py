@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.mesh import write_atomically
+from datagen.printable import printable
 from training.comparison import Comparison, ErrorScale, Solid, best_of, in_view, methods_in, output_of, placed
 from training.lighting import ground_shadow, openness
 from training.palette import ERROR_COLORS, ROLE_COLORS, method_colors
@@ -69,9 +70,9 @@ def write_viewer(
     payload = viewer_payload(examples, error_scale=error_scale or ErrorScale())
     licence = f"/*\n{_asset('THREE-LICENSE.txt')}*/\n"  # a page is a copy of three.js, so its licence goes along
     page = Template(_asset("viewer.html")).substitute(
-        title=html.escape(title),
+        title=html.escape(printable(title)),
         style=_asset("viewer.css"),
-        data=_inert_json(payload),
+        data=_inert_json(_printable(payload)),
         bundle=licence + _asset("viewer.bundle.js"),
     )
     write_atomically(Path(path), page.encode())
@@ -178,7 +179,16 @@ def _base64(array: npt.NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def _inert_json(payload: dict[str, Any]) -> str:
+def _printable(value: Any) -> Any:
+    """Return a payload whose texts, names among the keys too, can be shown."""
+    if isinstance(value, dict):
+        return {printable(key): _printable(its) for key, its in value.items()}
+    if isinstance(value, list):
+        return [_printable(its) for its in value]
+    return printable(value) if isinstance(value, str) else value
+
+
+def _inert_json(payload: Any) -> str:
     """Return JSON that cannot end the script element it stands in, nor open a comment there."""
     text = json.dumps(payload, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

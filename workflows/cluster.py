@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.errors import ClusterError, RecipeError
+from datagen.printable import printable
 
 _ROOT = Path(__file__).resolve().parents[1]
 _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
@@ -33,9 +34,13 @@ def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
     Raises
     ------
     RecipeError
-        A relative path while running on a cluster, where the working directory is a throw-away copy; or a URL where
-        only a folder will do.
+        A relative path while running on a cluster, where the working directory is a throw-away copy; a URL where
+        only a folder will do; or a name that no page, log or server could show.
     """
+    if printable(place) != place:
+        raise RecipeError(
+            f"{option} '{printable(place)}' holds control characters or bytes that are not UTF-8. Choose another name"
+        )
     if "://" in place:
         if urls:
             return place

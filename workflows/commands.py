@@ -3,6 +3,8 @@
 import argparse
 from collections.abc import Callable
 
+from datagen.printable import printable_lines
+
 Command = Callable[[argparse.Namespace], None]
 
 
@@ -32,7 +34,12 @@ def _keys() -> str:
     return "\n".join(["keys for --set, with their defaults:", *describe_fields()])
 
 
+def print_text(text: object) -> None:
+    """Print text of one or more lines; names in it that others chose do nothing to the terminal."""
+    print(printable_lines(text), flush=True)
+
+
 def print_facts(facts: dict[str, str]) -> None:
     """Two aligned columns."""
     width = max(map(len, facts))
-    print("\n".join(f"{name:{width}}  {value}" for name, value in facts.items()))
+    print_text("\n".join(f"{name:{width}}  {value}" for name, value in facts.items()))

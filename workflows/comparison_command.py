@@ -9,6 +9,7 @@ from datagen.errors import RecipeError
 from training.record import EXPERIMENT
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
+from workflows.commands import print_text
 from workflows.comparing import OWN, Settings, run_comparison
 from workflows.comparison_plan import Kind, known_comparisons, plan_comparison
 from workflows.console import add_set_option, add_tracking_option, alone_in, server_of
@@ -62,7 +63,7 @@ def _run(options: argparse.Namespace, kind: Kind) -> None:
             run_comparison(comparison, out, settings, command=_command_line(options, kind))
         finally:
             outage = mirror.close()
-    print(closing_words(out, f"{server.uri}, experiment {EXPERIMENT!r}"))
+    print_text(closing_words(out, f"{server.uri}, experiment {EXPERIMENT!r}"))
     if outage:
         raise outage
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 
 from datagen.errors import RecipeError
+from datagen.printable import printable
 from datagen.recipe import Frozen
 from workflows.named_recipes import nearest
 from workflows.recipe import WorkflowRecipe
@@ -85,7 +86,7 @@ def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: Kind
     file, words = _read(path), tuple(shared)
     entries = [TrialEntry(name=_folder(m.name), description=m.description, set=m.set) for m in file.methods]
     sweep = resolve(entries, recipe=file.recipe, words=(*file.set, *words))
-    names = [method.name for method in file.methods]
+    names = [printable(method.name) for method in file.methods]
     return ComparisonPlan(kind, path.stem, file.description, sweep, dict(zip(names, sweep.trials, strict=True)))
 
 

@@ -37,7 +37,7 @@ def write_comparison_report(plan: ComparisonPlan, out: Path, runs: Mapping[str, 
         dataset_card(dataset),
         *(_card(name, run, dataset, rows) for name, run in runs.items()),
     ]
-    write_report(out, title=plan.title, lead=plan.description, sections=sections)
+    write_report(out, title=plan.title, lead=plain(plan.description), sections=sections)
     return (out / FOLDER / "tables.md").read_text()
 
 

@@ -9,6 +9,7 @@ from training.evaluation import Row
 from training.inference_time import Inference
 from training.journal import read_journal
 from training.paper import PaperData
+from training.report_inline import plain
 from training.sweep_figures import PMD_UNIT, run_curve
 from training.tables import DEFINITIONS, markdown, note_1, note_2, note_3, summary, table_1, table_2, table_3
 from training.triples import last_step_of
@@ -52,8 +53,8 @@ def tables_of(
 
 def as_markdown(plan: ComparisonPlan, tables: list[NamedTable], about: str) -> str:
     """The tables as one Markdown document."""
-    parts = [f"## {table.title}\n\n{markdown(table.lines)}\n\n{table.notes}".rstrip() for table in tables]
-    return "\n\n".join([f"# {plan.title}", about, *parts]) + "\n"
+    parts = [f"## {plain(table.title)}\n\n{markdown(table.lines)}\n\n{table.notes}".rstrip() for table in tables]
+    return "\n\n".join([f"# {plain(plan.title)}", plain(about), *parts]) + "\n"
 
 
 def _costs(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path]) -> list[list[str]]:

@@ -15,7 +15,9 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from datagen.errors import DsffnetError, RecipeError
+from datagen.printable import printable, printable_lines
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
+from training.tracking_store import sqlite_file, sqlite_server
 from workflows.cluster import require_reachable
 from workflows.named_recipes import known_recipes
 
@@ -49,13 +51,15 @@ def guarded(main: Callable[[], None]) -> None:
 
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop.
     """
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    logging.basicConfig(level=logging.WARNING)
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(_Printable("%(levelname)s: %(message)s"))
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: _interrupt(told))
     try:
         main()
     except DsffnetError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         sys.exit(error.exit_status)
     except KeyboardInterrupt:
         word, status = ("stopped", 143) if told.is_set() else ("interrupted", 130)
@@ -63,8 +67,15 @@ def guarded(main: Callable[[], None]) -> None:
         sys.exit(status)
     except OSError as error:
         log.debug("as raised", exc_info=True)
-        print(f"error: {error}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
+        print(f"error: {printable(error)}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
         sys.exit(1)
+
+
+class _Printable(logging.Formatter):
+    """Messages in which names that others chose do nothing to the terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_lines(super().format(record))
 
 
 def _interrupt(told: threading.Event) -> None:
@@ -129,16 +140,10 @@ def add_tracking_option(made: argparse.ArgumentParser) -> None:
 def server_of(out: Path, uri: str | None) -> Server:
     """The MLflow server to mirror to: as asked, as the environment says, or a SQLite store in ``out``."""
     uri = uri or os.environ.get("MLFLOW_TRACKING_URI")
-    if uri and uri.startswith("sqlite:///"):
-        place = require_reachable(uri.removeprefix("sqlite:///"), option="--tracking-uri sqlite:///")
-        return _sqlite(Path(place))
-    return Server(uri) if uri else _sqlite(out.absolute() / "mlflow.db")
-
-
-def _sqlite(database: Path) -> Server:
-    """A SQLite store with its artifacts beside it."""
-    database.parent.mkdir(parents=True, exist_ok=True)
-    return Server(f"sqlite:///{database}", artifacts=database.parent / "mlartifacts")
+    database = sqlite_file(uri or "")
+    if database:
+        return sqlite_server(Path(require_reachable(str(database), option="--tracking-uri sqlite:///")))
+    return Server(uri) if uri else sqlite_server(out.absolute() / "mlflow.db")
 
 
 def server_of_record(root: Path, uri: str | None) -> Server:
@@ -206,7 +211,8 @@ def start_over(out: Path) -> None:
     """
     from datagen.places import remove
 
-    strangers = {path.name for path in out.iterdir()} - {".lock", "mlflow.db", "mlartifacts", *_OWN}
+    strangers = {path.name for path in out.iterdir() if not path.name.startswith("mlflow.db")}
+    strangers -= {".lock", "mlartifacts", *_OWN}
     if strangers and not (out / "recipe.yaml").exists():
         raise RecipeError(
             f"{out} holds files but no workflow of ours, so --fresh leaves it alone. Choose another --out"
@@ -234,8 +240,8 @@ def closing_words(out: Path, server: Server) -> str:
     programs = _programs()
     dsffnet = f"{programs}dsffnet"
     ui = (
-        f"make ui OUT={shown}"
-        if server.uri == f"sqlite:///{out / 'mlflow.db'}"
+        f"make ui OUT={shlex.quote(str(shown).replace('$', '$$'))}"
+        if sqlite_file(server.uri) == out / "mlflow.db"
         else f"look at MLflow ({server.uri}), experiment {EXPERIMENT!r}"
     )
     return f"""

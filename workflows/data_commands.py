@@ -8,7 +8,7 @@ from typing import Any
 
 from datagen.errors import DatasetError, RecipeError
 from datagen.recipe import PATH_KEYS, DatasetRecipe
-from workflows.commands import Command, add_command, print_facts
+from workflows.commands import Command, add_command, print_facts, print_text
 from workflows.data_arguments import (
     declare_append,
     declare_convert,
@@ -55,7 +55,7 @@ def inspect_command(options: argparse.Namespace) -> None:
     if options.picture != "none" and is_complete(options.dataset):
         default = f"{Path(options.dataset).name.removesuffix('.zarr')}-contact-sheet.png"
         path = draw_contact_sheet(open_dataset(options.dataset), Path(options.picture or default))
-        print(f"picture: {path}")
+        print_text(f"picture: {path}")
 
 
 def verify_command(options: argparse.Namespace) -> None:
@@ -72,16 +72,16 @@ def verify_command(options: argparse.Namespace) -> None:
         find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
     )
     for fault in faults:
-        print(f"fault: {fault.path}: {fault.reason}")
+        print_text(f"fault: {fault.path}: {fault.reason}")
     complete = is_complete(options.dataset)
     if not faults and complete:
-        print(f"{options.dataset} is whole")
+        print_text(f"{options.dataset} is whole")
         return
     if not options.repair:
         found = f"has {len(faults)} faults" if faults else "is not complete"
         raise DatasetError(f"{options.dataset} {found}. Mend it: dsffnet verify {options.dataset} --repair")
     repair(options.dataset, recipe, faults, run=inline, progress=generation_bar)
-    print(f"{options.dataset} is whole again")
+    print_text(f"{options.dataset} is whole again")
 
 
 def _own_recipe(url: str, overrides: Sequence[str]) -> DatasetRecipe:
@@ -144,14 +144,14 @@ def export_command(options: argparse.Namespace) -> None:
         fresh=options.fresh,
         progress=lambda cells: bar(cells, total=len(cells), what="export", unit="mesh"),
     )
-    print(f"{options.out}: {written} files written")
+    print_text(f"{options.out}: {written} files written")
 
 
 def convert_body_command(options: argparse.Namespace) -> None:
     """Write an original SMPL or SMAL file (a pickle) as plain arrays; nothing in it is executed."""
     from datagen.model_files import convert_model
 
-    print(f"written: {convert_model(Path(options.model), Path(options.out))}")
+    print_text(f"written: {convert_model(Path(options.model), Path(options.out))}")
 
 
 def stand_in_command(options: argparse.Namespace) -> None:
@@ -160,7 +160,7 @@ def stand_in_command(options: argparse.Namespace) -> None:
 
     path = write_standin(options.kind, Path(options.out), topology=options.topology)
     family = "smal" if options.kind == "smal" else f"smpl data.body.model={options.kind}"
-    print(
+    print_text(
         f"written: {path}. It is not the licensed model. Use it: --set data.body.family={family} data.body.path={path}"
     )
 

@@ -26,6 +26,7 @@ from training.record import read_record, update_record
 from training.report import NAMES, report_is_current, workflow_report
 from training.tracking import Mirror
 from workflows.cluster import ray_cluster, require_reachable
+from workflows.commands import print_text
 from workflows.console import alone_in, closing_words, guarded, server_of, start_over, workflow_parser
 from workflows.pipeline import (
     check_run_accepts,
@@ -57,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
             run_workflow(recipe, out)
         finally:
             outage = mirror.close()
-    print(closing_words(out, server))
+    print_text(closing_words(out, server))
     if outage:
         raise outage
 

@@ -21,12 +21,23 @@ from training.generalisation import (
     write_rows,
 )
 from training.generalisation_figures import Shown, generalisation_picture, heat_map
+from training.report_inline import plain
 from training.robustness import Case, methods_in
 from training.scores import LoadedMethod
 from workflows.cluster import require_reachable
+from workflows.commands import print_text
 from workflows.evaluated import Evaluated
 from workflows.kinds import OTHERS, TOPOLOGIES, Sizes, imported_kind, make_kinds, own_kind, own_recipe
-from workflows.probes import about_weights, add_weights_options, folder_of, methods_of, same_settings, study, weights_of
+from workflows.probes import (
+    about_weights,
+    add_weights_options,
+    folder_of,
+    methods_of,
+    same_settings,
+    study,
+    sync_words,
+    weights_of,
+)
 from workflows.progress import bar
 from workflows.recipe import load_recipe
 from workflows.stages import say
@@ -90,7 +101,9 @@ def generalisation_command(options: argparse.Namespace) -> None:
         text = report(rows, methods, kinds, sizes, trained)
         write_atomically(folder / "generalisation.md", text.encode())
         metrics.update(_metrics(rows, names))
-    print(f"{text}\npictures, rows, data, this text: {folder} ({', '.join(_FILES)}). To MLflow: dsffnet sync {folder}")
+    print_text(
+        f"{text}\npictures, rows, data, this text: {folder} ({', '.join(_FILES)}). To MLflow: {sync_words(folder)}"
+    )
 
 
 def _sizes(options: argparse.Namespace) -> Sizes:
@@ -188,11 +201,11 @@ def report(
     """The study as Markdown."""
     names = [kind.name for kind in kinds]
     whose = "; ".join(
-        f"{method.name}: step {method.step:,}, trained on {own or 'none of these kinds'}"
+        f"{plain(method.name)}: step {method.step:,}, trained on {plain(own) or 'none of these kinds'}"
         for method, own in zip(methods, trained, strict=True)
     )
     grids = "\n\n".join(
-        f"## {name}\n\nPMD x1e-4\n\n{grid_table(rows, names, name)}\n\nmm\n\n"
+        f"## {plain(name)}\n\nPMD x1e-4\n\n{grid_table(rows, names, name)}\n\nmm\n\n"
         f"{grid_table(rows, names, name, field='millimetres', factor=1)}"
         for name in methods_in(rows)
         if grid_of(rows, names, name).size

@@ -2,12 +2,14 @@
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from datagen.errors import DsffnetError
 from datagen.generate import generate
+from datagen.printable import printable
 from datagen.recipe import (
     AnnyBody,
     AnnyTopology,
@@ -45,12 +47,20 @@ class Sizes:
 
 
 def own_recipe(home: Path) -> DatasetRecipe | None:
-    """The recipe of the dataset that a run was trained on, as far as the run still finds it."""
+    """The recipe of the dataset that a run was trained on: beside the run, or where it was then; None where neither."""
     try:
-        url = json.loads((home / "provenance.json").read_text())["dataset"]["url"]
-        return open_dataset(url).recipe
-    except (OSError, ValueError, KeyError, DsffnetError):
+        about = json.loads((home / "provenance.json").read_text())["dataset"]
+        found = (_recipe_at(url, about["uuid"]) for url in (str(home.parent / "dataset.zarr"), about["url"]))
+        return next(filter(None, found), None)
+    except (OSError, ValueError, KeyError):
         return None
+
+
+def _recipe_at(url: str, uuid: str) -> DatasetRecipe | None:
+    with suppress(OSError, DsffnetError):
+        dataset = open_dataset(url)
+        return dataset.recipe if dataset.uuid == uuid else None
+    return None
 
 
 def people_recipe(base: DatasetRecipe, topology: AnnyTopology, sizes: Sizes) -> DatasetRecipe:
@@ -130,7 +140,8 @@ def _kind(recipe: DatasetRecipe, url: Path) -> Kind:
 def imported_kind(url: str) -> Kind:
     """A dataset of a person's own: its poses are its alone."""
     dataset = open_dataset(url)
-    return Kind(f"{Path(url).name.removesuffix('.zarr')} {_counts(dataset)}", dataset, dataset.uuid)
+    name = printable(Path(url).name.removesuffix(".zarr"))
+    return Kind(f"{name} {_counts(dataset)}", dataset, dataset.uuid)
 
 
 def kind_name(dataset: Dataset) -> str:

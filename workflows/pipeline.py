@@ -25,7 +25,8 @@ from training.inference import load_trained
 from training.launch import launch
 from training.ranks import TrainingError, TrainingStopped
 from training.recipe import EvaluationRecipe, TrainingRecipe
-from training.record import MODEL, begin_record, end_record, flatten, read_record, update_record
+from training.record import MODEL, Record, begin_record, end_record, flatten, read_record, update_record
+from training.report_inline import plain
 from training.report_origin import this_commit, this_machine
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
@@ -34,6 +35,9 @@ from workflows.console import alone_in
 from workflows.evaluated import evaluated
 from workflows.progress import bar, following, sampling
 from workflows.stages import say
+
+_CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
+"""Attributes that tell a dataset from all others, wherever it lies."""
 
 
 @contextmanager
@@ -130,12 +134,14 @@ def evaluate_stage(
     network, trained, step = load_trained(what.weights)
     method = Method(method_name(trained.network), str(what.weights))
     folder = what.folder(dataset)
-    with recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=recipe.model_dump(mode="json")):
+    parameters = recipe.model_dump(mode="json")
+    about_run = recorded(folder, kind="evaluate", name="evaluate", parent=parent, parameters=parameters)
+    with alone_in(folder), about_run:
         with sampling(folder / "system.jsonl"):
             keep = folder / "measured"
             rows = evaluate([method], data, recipe, tasks=ray_runner, keep=keep, progress=evaluation_bar)
         write_rows(rows, folder / "rows.csv")
-        about = f"Weights of step {step:,} on {Path(dataset.url).name} ({dataset.uuid})."
+        about = f"Weights of step {step:,} on {plain(Path(dataset.url).name)} ({dataset.uuid})."
         text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
         write_atomically(folder / "tables.md", text.encode())
         draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
@@ -199,13 +205,18 @@ def is_evaluated(recipe: EvaluationRecipe, data: str, run: Path) -> bool:
     """Whether the outputs of this evaluation on this dataset are there."""
     names = ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png")
     record = read_record(run / "evaluation")
+    if record is None or record.status != "FINISHED" or record.parameters != flatten(recipe.model_dump(mode="json")):
+        return False
+    return _is_of(record, data) and all((run / "evaluation" / name).is_file() for name in names)
+
+
+def _is_of(record: Record, data: str) -> bool:
+    """Whether a record's dataset has the content of this one, wherever either lies: folders are moved and copied."""
     try:
-        same = record is not None and record.dataset == about_dataset(open_dataset(data))
+        there = about_dataset(open_dataset(data))
     except DsffnetError:
         return False
-    wanted = flatten(recipe.model_dump(mode="json"))
-    same = same and record is not None and record.parameters == wanted and record.status == "FINISHED"
-    return same and all((run / "evaluation" / name).is_file() for name in names)
+    return record.dataset is not None and all(record.dataset.get(key) == there[key] for key in _CONTENT)
 
 
 def summary_metrics(rows: list[Row]) -> dict[str, float]:
@@ -225,8 +236,7 @@ def summary_metrics(rows: list[Row]) -> dict[str, float]:
 
 def about_dataset(dataset: Dataset) -> dict[str, str]:
     """What identifies a dataset."""
-    keys = ("uuid", "recipe_sha256", "manifest_sha256")
-    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in keys}
+    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in _CONTENT}
 
 
 def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, poses: int = 8) -> Path:

@@ -5,6 +5,7 @@ Results are files in one folder; a record beside them lets ``dsffnet sync FOLDER
 
 import argparse
 import json
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
+from datagen.printable import printable
 from training.evaluation import fingerprint_of
 from training.record import read_record, update_record
 from training.scores import LoadedMethod, load_methods
@@ -57,7 +59,7 @@ def _shown(weights: Evaluated) -> str:
     """What a person calls weights: their run's folder (a workflow's where the run is its ``run``), and their label."""
     home = weights.home.resolve()
     name = home.parent.name if home.name == "run" else home.name
-    return " ".join(filter(None, (name, weights.label)))
+    return printable(" ".join(filter(None, (name, weights.label))))
 
 
 def folder_of(options: argparse.Namespace, weights: Sequence[Evaluated], study: str) -> Path:
@@ -93,8 +95,13 @@ def parent_of(weights: Sequence[Evaluated]) -> Path | None:
 
 
 def about_weights(weights: Sequence[Evaluated]) -> list[str]:
-    """What tells these weights from all others, as plain data."""
-    return [f"{its.weights.resolve()} step {its.checkpoint.step} {fingerprint_of(its.checkpoint)}" for its in weights]
+    """What tells these weights from all others, wherever they lie, as plain data."""
+    return [f"step {its.checkpoint.step} {fingerprint_of(its.checkpoint)}" for its in weights]
+
+
+def sync_words(folder: Path) -> str:
+    """The command that sends a study to MLflow."""
+    return f"dsffnet sync {shlex.quote(str(folder))}"
 
 
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:

@@ -9,6 +9,7 @@ from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from datagen.store import open_dataset
 from training.disturbances import DISTURBANCES, Disturbance
+from training.report_inline import plain
 from training.robustness import Case, RobustnessRow, cases_of, measured, read_rows, refusal, steps, write_rows
 from training.robustness_figures import (
     disturbance_picture,
@@ -20,7 +21,17 @@ from training.robustness_figures import (
 from training.robustness_tables import amounts_table, curve, limits_table, no_op
 from training.scores import LoadedMethod
 from workflows.cluster import require_reachable
-from workflows.probes import about_weights, add_weights_options, folder_of, methods_of, same_settings, study, weights_of
+from workflows.commands import print_text
+from workflows.probes import (
+    about_weights,
+    add_weights_options,
+    folder_of,
+    methods_of,
+    same_settings,
+    study,
+    sync_words,
+    weights_of,
+)
 from workflows.progress import bar
 
 _FILES = ("robustness.md", "rows.csv", "curves.png", "noise.png", "disturbances.png")
@@ -66,7 +77,7 @@ def robustness_command(options: argparse.Namespace) -> None:
         _draw(folder, rows, methods, cases[options.example])
         text = report(rows, methods, disturbances, data=Path(data).name, cases=len(cases))
         write_atomically(folder / "robustness.md", text.encode())
-    print(f"{text}\npictures, rows, this text: {folder} ({', '.join(_FILES)}). To MLflow: dsffnet sync {folder}")
+    print_text(f"{text}\npictures, rows, this text: {folder} ({', '.join(_FILES)}). To MLflow: {sync_words(folder)}")
 
 
 def _asked(options: argparse.Namespace) -> list[Disturbance]:
@@ -136,12 +147,12 @@ def report(
 ) -> str:
     """The study as Markdown: what was done, where it breaks, every number."""
     left_out = [_left_out(method, disturbances) for method in methods]
-    start = ", ".join(f"{its.name} {_undisturbed(rows, its):.2f}" for its in methods)
-    trained = "; ".join(f"{method.name}: step {method.step:,}" for method in methods)
+    start = ", ".join(f"{plain(its.name)} {_undisturbed(rows, its):.2f}" for its in methods)
+    trained = "; ".join(f"{plain(method.name)}: step {method.step:,}" for method in methods)
     return (
-        f"# Robustness to a disturbed source\n\nWeights: {trained}. Dataset {data}, its first {cases} evaluation "
-        f"triples of new identities. Only the source is changed, before its normalisation; ground truth and target "
-        f"stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, times 1e4. "
+        f"# Robustness to a disturbed source\n\nWeights: {trained}. Dataset {plain(data)}, its first {cases} "
+        "evaluation triples of new identities. Only the source is changed, before its normalisation; ground truth and "
+        "target stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, times 1e4. "
         f"Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
         f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m.\n\n"
         f"## Where it breaks\n\n{limits_table(rows)}\n\n"
@@ -155,7 +166,7 @@ def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
     """A line that says what a method could not take, and why."""
     refused = [its for its in disturbances if refusal(method, its)]
     names = ", ".join(its.heading.lower() for its in refused)
-    return f"- {method.name} without {names}: {refusal(method, refused[0])}.\n\n" if refused else ""
+    return f"- {plain(method.name)} without {names}: {refusal(method, refused[0])}.\n\n" if refused else ""
 
 
 def _undisturbed(rows: Sequence[RobustnessRow], method: LoadedMethod) -> float:

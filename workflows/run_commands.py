@@ -1,12 +1,13 @@
 """The subcommands of ``dsffnet`` about single runs: train, evaluate, sync; and printing a recipe."""
 
 import argparse
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from datagen.errors import DatasetError
-from workflows.commands import Command, add_command
+from workflows.commands import Command, add_command, print_text
 from workflows.console import add_recipe_options, add_tracking_option, server_of, server_of_record
 from workflows.evaluated import which_checkpoint
 from workflows.recipe import load_recipe
@@ -28,7 +29,8 @@ def train_command(options: argparse.Namespace) -> None:
             remove_run(run)
     with _mirrored(run, options), ray_cluster() if recipe.launcher == "ray" else nullcontext():
         train_stage(recipe, data, run, parent=None)
-    print(f"trained: {options.out}. Next: dsffnet evaluate {options.out} --data {options.data}")
+    out, data = shlex.quote(options.out), shlex.quote(options.data)
+    print_text(f"trained: {options.out}. Next: dsffnet evaluate {out} --data {data}")
 
 
 def evaluate_command(options: argparse.Namespace) -> None:
@@ -45,7 +47,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     open_dataset(data)
     with _mirrored(home, options), ray_cluster():
         parent = home if read_record(home) else None
-        print(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
+        print_text(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
 
 
 def sync_command(options: argparse.Namespace) -> None:
@@ -60,7 +62,7 @@ def sync_command(options: argparse.Namespace) -> None:
         raise DatasetError(f"{run} holds no record of a run. Name the folder that a workflow or training wrote to")
     server = server_of_record(records[0], options.tracking_uri)
     publish(run.resolve(), server)
-    print(f"{server.uri} is up to date with {run} ({len(records)} runs)")
+    print_text(f"{server.uri} is up to date with {run} ({len(records)} runs)")
 
 
 def recipe_command(options: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
+from datagen.printable import printable
 from training.record import read_record
 
 
@@ -69,7 +70,7 @@ def once(work: Callable[[], None]) -> Callable[[], None]:
 
 def say(text: str) -> None:
     """One line for people, with the time of day, at once."""
-    print(f"[{time.strftime('%H:%M:%S')}] {text}", flush=True)
+    print(f"[{time.strftime('%H:%M:%S')}] {printable(text)}", flush=True)
 
 
 def _done(mark: Path, stage: Stage) -> bool:

@@ -10,6 +10,7 @@ from datagen.errors import RecipeError
 from training.record import EXPERIMENT
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
+from workflows.commands import print_text
 from workflows.console import add_recipe_options, add_tracking_option, alone_in, server_of
 from workflows.sweep_report import Result, best_of, parse_levels
 from workflows.sweeping import Settings, remove_sweep, run_sweep
@@ -60,7 +61,7 @@ def sweep_command(options: argparse.Namespace) -> None:
     mirror = Mirror(out, server)
 
     def show(results: list[Result]) -> None:
-        print(closing_words(results, out, f"{server.uri}, experiment {EXPERIMENT!r}"))
+        print_text(closing_words(results, out, f"{server.uri}, experiment {EXPERIMENT!r}"))
 
     with alone_in(out):
         if options.fresh:

@@ -11,6 +11,8 @@ from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from training.journal import read_journal
 from training.record import read_record
+from training.report_inline import plain
+from training.row_files import inert
 from training.sweep_figures import PMD_UNIT, RunCurve, run_curve, sweep_figure
 from training.tables import markdown
 from workflows.trials import Sweep, Trial, varied_values
@@ -119,17 +121,19 @@ def report(sweep: Sweep, results: Sequence[Result], *, name: str, levels: dict[s
     shared = {word.split("=", 1)[0]: word for word in sweep.words}.values()  # a key may be given twice; the last counts
     triples = min(sweep.recipe.training.evaluate_triples, sweep.recipe.data.triples.count)
     parts = [
-        f"# Sweep {name}",
-        f"{len(results)} trainings from recipe {sweep.recipe_name}"
-        + (f" with {' '.join(shared)}" if shared else "")
+        f"# Sweep {plain(name)}",
+        f"{len(results)} trainings from recipe {plain(sweep.recipe_name)}"
+        + (f" with {plain(' '.join(shared))}" if shared else "")
         + ". Lower PMD is better.",
         markdown(table(results, levels)),
-        f"Best: **{best.trial.name}** ({_words(best.trial)})." if best else "No trial has finished.",
+        f"Best: **{best.trial.name}** ({plain(_words(best.trial))})." if best else "No trial has finished.",
         _DEFINITION.format(triples=triples, threads=threads),
     ]
     described = [result.trial for result in results if result.trial.description]
-    parts += ["\n".join(f"- **{trial.name}**: {trial.description} ({_words(trial)})" for trial in described)]
-    parts += [f"- **{result.trial.name}** failed: {result.reason}" for result in results if result.state == "failed"]
+    parts += [
+        "\n".join(f"- **{trial.name}**: {plain(f'{trial.description} ({_words(trial)})')}" for trial in described)
+    ]
+    parts += [f"- **{each.trial.name}** failed: {plain(each.reason)}" for each in results if each.state == "failed"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -162,7 +166,7 @@ def table_csv(sweep: Sweep, results: Sequence[Result], levels: dict[str, float])
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: inert(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from datagen.errors import RecipeError
-from workflows.commands import add_command
+from workflows.commands import add_command, print_text
 from workflows.evaluated import evaluated, which_checkpoint
 
 _EXAMPLES = """\
@@ -75,7 +75,7 @@ def transfer_command(options: argparse.Namespace) -> None:
 
         work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
         work.settle_axes(weights)
-        print(work.run())
+        print_text(work.run())
 
 
 @contextmanager
@@ -100,7 +100,9 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path]:
 
 def _tracking_uri(asked: str | None) -> str:
     """The server of registered models: as asked, as the environment says, or the quickstart's own store."""
-    own = f"sqlite:///{_OWN_STORE.absolute()}" if _OWN_STORE.is_file() else ""
+    from training.tracking_store import sqlite_server
+
+    own = sqlite_server(_OWN_STORE.absolute()).uri if _OWN_STORE.is_file() else ""
     uri = asked or os.environ.get("MLFLOW_TRACKING_URI") or own
     if not uri:
         raise RecipeError("models:/ needs an MLflow server: add --tracking-uri URI, or set MLFLOW_TRACKING_URI")

@@ -17,6 +17,7 @@ from datagen.mesh import Mesh
 from datagen.mesh_files import MeshFile, write_posed
 from datagen.mesh_glb_written import FRAME_LIMIT
 from datagen.mesh_sequences import write_animation
+from datagen.printable import printable
 from training.alignment import UPRIGHT, Axes, orientation
 from training.refinement import DEFAULT_WEIGHT
 from training.transfer import PoseTransfer
@@ -33,7 +34,7 @@ _VOTING_FRAMES = 3  # of a sequence, on how it stands
 
 def warn(line: str) -> None:
     """One line on standard error."""
-    print(f"warning: {line}", file=sys.stderr)
+    print(f"warning: {printable(line)}", file=sys.stderr)
 
 
 class TransferWork:

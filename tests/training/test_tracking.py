@@ -34,14 +34,6 @@ from training.transfer import PoseTransfer
 from training.unlikeness import seen_by
 
 
-@pytest.fixture(scope="session")
-def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An MLflow database with its tables, which take seconds to make."""
-    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
-    mlflow.MlflowClient(f"sqlite:///{path}").search_experiments()
-    return path
-
-
 @pytest.fixture
 def server(empty_store: Path, tmp_path: Path) -> Server:
     (tmp_path / "mlflow.db").write_bytes(empty_store.read_bytes())
@@ -251,8 +243,8 @@ def test_summary_metrics_sent_twice_are_one_point_and_a_later_value_wins(root: P
 
 
 def test_what_the_server_refuses_of_one_record_does_not_keep_back_the_others(root: Path, server: Server) -> None:
-    update_record(root, metrics={"not a name!": 1.0})
-    with pytest.raises(TrackingError, match="not a name!"):
+    update_record(root, metrics={"pmd": "no number"})
+    with pytest.raises(TrackingError, match="no number"):
         publish(root, server)
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
 

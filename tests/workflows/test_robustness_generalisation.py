@@ -139,11 +139,21 @@ def test_recipes_of_other_bodies_lend_poses_only_where_people_can_take_them() ->
 
 def test_a_run_knows_its_data_as_long_as_that_is_there(dataset: str, tmp_path: Path) -> None:
     assert own_recipe(tmp_path) is None
-    (tmp_path / "provenance.json").write_text(json.dumps({"dataset": {"url": dataset}}))
-    own = own_recipe(tmp_path)
+    uuid, run = open_dataset(dataset).uuid, tmp_path / "run"
+
+    def note(**about: str) -> None:
+        run.mkdir(exist_ok=True)
+        (run / "provenance.json").write_text(json.dumps({"dataset": about}))
+
+    note(url=dataset, uuid=uuid)
+    own = own_recipe(run)
     assert own == tiny_dataset() and own_kind(own, [imported_kind(dataset)]) == "leg 32"
-    (tmp_path / "provenance.json").write_text(json.dumps({"dataset": {"url": str(tmp_path / "gone.zarr")}}))
-    assert own_recipe(tmp_path) is None
+    note(url=str(tmp_path / "gone.zarr"), uuid=uuid)
+    assert own_recipe(run) is None
+    shutil.copytree(dataset, tmp_path / "dataset.zarr")
+    assert own_recipe(run) == tiny_dataset(), "both were moved together"
+    note(url=dataset, uuid="of other data")
+    assert own_recipe(run) is None
 
 
 def test_examples_show_every_other_kind_and_mark_what_has_no_truth(dataset: str, tmp_path: Path) -> None:
