@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from datagen.mesh import Mesh, bounding_box
-from training.figure_style import DPI, INK, PAGE, saved
+from training.figure_style import DPI, INK, PAGE, saved, short
 from training.figures import ROLE_COLORS
 from training.generalisation import GeneralisationRow, grid_of, no_op_line
 from training.mesh_grid import Panel, Row, mesh_grid, standing
@@ -65,7 +65,7 @@ def heat_map(
     every = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for number, (axes, name, grid) in enumerate(zip(every, names, grids, strict=True)):
         _draw_grid(axes, grid, kinds, norm, own=trained[number] if number < len(trained) else "")
-        axes.set_title(name, fontsize=8.5, weight="bold", color=INK, pad=5, parse_math=False)
+        axes.set_title(short(name), fontsize=8.5, weight="bold", color=INK, pad=5, parse_math=False)
         axes.set_xlabel("target", fontsize=8, color=INK)
     every[0].set_ylabel("source", fontsize=8, color=INK)
     figure.suptitle(title, fontsize=8.5, color=INK, x=0.01, ha="left", parse_math=False)
@@ -95,7 +95,7 @@ def _draw_grid(axes: Axes, grid: NDArray[np.float64], kinds: Sequence[str], norm
 
 def _broken(name: str) -> str:
     """A name with its last word on a line of its own."""
-    return "\n".join(name.rsplit(" ", 1))
+    return "\n".join(short(name, 24).rsplit(" ", 1))
 
 
 def generalisation_picture(

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from datagen.mesh import Mesh, bounding_box
 from training.disturbances import DISTURBANCES, Disturbance
-from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved, short
 from training.mesh_grid import Panel, Row, drawable, mesh_grid, standing
 from training.palette import ROLE_COLORS, method_colors
 from training.robustness import Case, RobustnessRow, disturbed, methods_in, refusal
@@ -47,7 +47,7 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.suptitle(title, fontsize=9, weight="bold", color=INK, x=0.01, ha="left", parse_math=False)
     place = {"loc": "outside lower left", "ncols": 7, "frameon": False}
-    legend = figure.legend(handles, names, fontsize=7.5, labelcolor=INK, **place)
+    legend = figure.legend(handles, [short(name) for name in names], fontsize=7.5, labelcolor=INK, **place)
     for text in legend.get_texts():
         text.set_parse_math(False)  # methods are called after folders
     return saved(figure, path)

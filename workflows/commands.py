@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from datagen.printable import printable_lines
+from datagen.printable import printable, printable_lines
 
 Command = Callable[[argparse.Namespace], None]
 
@@ -42,4 +42,4 @@ def print_text(text: object) -> None:
 def print_facts(facts: dict[str, str]) -> None:
     """Two aligned columns."""
     width = max(map(len, facts))
-    print_text("\n".join(f"{name:{width}}  {value}" for name, value in facts.items()))
+    print_text("\n".join(printable(f"{name:{width}}  {value}") for name, value in facts.items()))

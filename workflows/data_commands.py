@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.errors import DatasetError, RecipeError
+from datagen.printable import printable
 from datagen.recipe import PATH_KEYS, DatasetRecipe
 from workflows.commands import Command, add_command, print_facts, print_text
 from workflows.data_arguments import (
@@ -72,7 +73,7 @@ def verify_command(options: argparse.Namespace) -> None:
         find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
     )
     for fault in faults:
-        print_text(f"fault: {fault.path}: {fault.reason}")
+        print_text(printable(f"fault: {fault.path}: {fault.reason}"))
     complete = is_complete(options.dataset)
     if not faults and complete:
         print_text(f"{options.dataset} is whole")

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from datagen.errors import RecipeError
+from datagen.printable import printable
 from workflows.commands import add_command, print_text
 from workflows.evaluated import evaluated, which_checkpoint
 
@@ -75,7 +76,7 @@ def transfer_command(options: argparse.Namespace) -> None:
 
         work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
         work.settle_axes(weights)
-        print_text(work.run())
+        print_text(printable(work.run()))
 
 
 @contextmanager

@@ -15,14 +15,17 @@ import psutil
 import pytest
 
 from datagen.errors import DatasetError
-from datagen.generate import append, generate, repair
+from datagen.generate import append, generate, inline, repair
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.schema import open_group, read_bytes, shard_path, write_bytes
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
 from tests.support.ranks import free_port
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import tiny_dataset, tiny_training
+from training.recipe import EvaluationRecipe
+from workflows import pipeline
+from workflows.pipeline import evaluate_stage, train_stage
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
 ROOT = Path(__file__).parents[2]
@@ -217,6 +220,23 @@ def test_two_generators_on_one_s3_dataset_do_no_harm(bucket: str, dataset: str) 
     both = [subprocess.Popen([sys.executable, "-c", code, url], cwd=ROOT) for _ in range(2)]
     assert [process.wait(120) for process in both] == [0, 0]
     assert open_dataset(url).uuid == open_dataset(dataset).uuid and not list(find_faults(url))
+
+
+def test_a_dataset_on_s3_is_trained_on_and_evaluated_as_one_on_the_disk(
+    bucket: str, dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, recipe = f"{bucket}/evaluated.zarr", EvaluationRecipe(emd_points=16, examples=1, chunk=2)
+    generate(tiny_dataset(), url)
+    monkeypatch.setattr(pipeline, "ray_runner", inline)
+    for place, name in ((url, "afar"), (dataset, "here")):
+        train_stage(tiny_training(), place, tmp_path / name, parent=None)
+        evaluate_stage(recipe, place, tmp_path / name, parent=tmp_path / name)
+        assert pipeline.is_evaluated(recipe, place, tmp_path / name)
+    afar, here = (tmp_path / name / "evaluation" for name in ("afar", "here"))
+    assert (afar / "rows.csv").read_bytes() == (here / "rows.csv").read_bytes()
+    names = {str(path.relative_to(here)) for path in here.rglob("*") if path.is_file()}
+    assert names == {str(path.relative_to(afar)) for path in afar.rglob("*") if path.is_file()}
+    assert "evaluated.zarr" in (afar / "tables.md").read_text()
 
 
 def test_ray_workers_write_to_s3(bucket: str, undisturbed: Path) -> None:

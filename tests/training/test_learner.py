@@ -3,6 +3,7 @@
 import contextlib
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,15 @@ def test_a_time_budget_stops_with_a_checkpoint_and_the_same_command_goes_on(data
             train(recipe, data=dataset, run=tmp_path / "run")
         reached.append(require_checkpoint(tmp_path / "run").step)
     assert 0 < reached[0] < reached[1]
+
+
+def test_a_clock_that_jumps_neither_spends_the_budget_nor_stops_the_training(
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, journal = time.time, tmp_path / "run" / "metrics.jsonl"
+    monkeypatch.setattr(time, "time", lambda: real() + (86_400 if journal.exists() else 0))
+    assert train(tiny_training(budget="1h"), data=dataset, run=tmp_path / "run") == 8
+    assert [row["step"] for row in read_journal(journal)] == list(range(1, 9))
 
 
 @pytest.mark.parametrize("every", [1, 4])

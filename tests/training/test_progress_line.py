@@ -76,5 +76,13 @@ def test_ranks_that_died_and_came_back_do_not_count_and_evaluations_do() -> None
     assert progress.seconds_left() == pytest.approx(800 * 120 / 200)
 
 
+@pytest.mark.parametrize("jump", [-86_400.0, 86_400.0])
+def test_a_clock_that_is_put_back_or_forward_does_not_count(jump: float) -> None:
+    rows = [(step, step * 0.1) for step in range(0, 200, 20)]
+    after = [(step, step * 0.1 + jump) for step in range(200, 400, 20)]
+    progress = fed(Progress(steps=1000), rows + after)
+    assert progress.seconds_left() == pytest.approx(620 * 0.1) and "1 min 2 s left" in progress.line()
+
+
 def test_nothing_to_say_before_the_first_row() -> None:
     assert Progress(steps=5).line() == "" and Progress(steps=5).seconds_left() is None

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,14 @@ def test_a_start_that_has_gone_is_not_missed_on_resume(dataset: str, tmp_path: P
 
 
 def test_a_left_over_stop_is_removed_and_one_made_since_is_heeded(dataset: str, tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / STOP_FILE).touch()
-    os.utime(tmp_path / STOP_FILE, (1, 1))
-    assert train(tiny_training(), data=dataset, run=tmp_path) == 8
-    assert not (tmp_path / STOP_FILE).exists()
+    tomorrow = time.time() + 86_400  # of a clock that was put back since
+    for number, moment in enumerate((1.0, tomorrow)):
+        run = tmp_path / str(number)
+        run.mkdir()
+        (run / STOP_FILE).touch()
+        os.utime(run / STOP_FILE, (moment, moment))
+        assert train(tiny_training(), data=dataset, run=run) == 8
+        assert not (run / STOP_FILE).exists()
     real = trainer.open_bank
 
     def told_meanwhile(*arguments: Any, **keywords: Any) -> Any:

@@ -82,6 +82,18 @@ def test_parent_child_parameters_metrics_artifacts_status(root: Path, server: Se
     ]
 
 
+def test_a_clock_that_was_put_back_gives_no_run_that_ends_before_it_began(root: Path, server: Server) -> None:
+    started = read_record(root / "run").started
+    update_record(root / "run", status="FINISHED", ended=started - 86_400_000)
+    with open(root / "run" / "metrics.jsonl", "a") as file:
+        file.write(json.dumps({"step": 6, "time": started / 1000 - 86_400, "loss/total": 0.1}) + "\n")
+    publish(root, server)
+    publish(root, server)
+    child = runs_of(server)["train"]
+    assert child.info.end_time >= child.info.start_time == started
+    assert [step for step, _ in history(server, child, "loss/total")] == [1, 2, 3, 4, 5, 6]
+
+
 def test_repeating_changes_nothing(root: Path, server: Server) -> None:
     for _ in range(3):
         publish(root, server)

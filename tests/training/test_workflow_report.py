@@ -95,6 +95,16 @@ def test_a_mark_of_an_earlier_command_is_not_taken_for_the_time_of_the_last(out:
     assert stages_of(out)[0]["took"] == "7.0 s"
 
 
+def test_a_clock_that_was_put_back_gives_no_negative_time(out: Path) -> None:
+    for folder in (out, out / "run"):
+        record = read_record(folder)
+        assert record is not None
+        update_record(folder, status="FINISHED", ended=record.started - 86_400_000)
+    os.utime(out / "stages/train.json", (0, 0))
+    assert stages_of(out)[0]["took"] == "" and "after it began" not in facts_of(out)["status"]
+    assert not any("-86400" in path.read_text(encoding="utf-8") for path in workflow_report(out))
+
+
 def test_a_workflow_that_still_runs_says_so_and_a_finished_one_how_long_it_took(out: Path) -> None:
     assert facts_of(out)["status"].startswith("stages finished 20"), "it is the workflow itself that writes its report"
     update_record(out / "run", status="KILLED")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -110,6 +111,19 @@ def test_run_again_every_stage_is_skipped_in_seconds(undisturbed: Path) -> None:
     assert status == 0 and output.count("skipped, finished before") == 4  # generate, train, evaluate, report
     assert "Where everything lies" in output and "dsffnet transfer --model" in output
     assert time.monotonic() - began < 30 and tree_hash(undisturbed / "run") == before
+
+
+def test_a_copy_elsewhere_is_finished_and_shows_its_own_artifacts(undisturbed: Path, tmp_path: Path) -> None:
+    import mlflow
+
+    before, copied = tree_hash(undisturbed), tmp_path / "a copy #2"
+    shutil.copytree(undisturbed, copied)
+    status, output = run(copied, *longer(copied))
+    assert status == 0 and output.count("skipped, finished before") == 4, output
+    assert tree_hash(undisturbed) == before
+    client = mlflow.MlflowClient(f"sqlite:///{copied / 'mlflow.db'}")
+    version = client.get_model_version_by_alias("dsffnet", "latest-trained").version
+    assert client.get_model_version_download_uri("dsffnet", version).startswith(copied.as_uri())
 
 
 def test_mlflow_shows_one_parent_three_children_and_a_loadable_model(undisturbed: Path) -> None:

@@ -1,5 +1,7 @@
 """``dsffnet transfer`` as a person types it: what is written and said, and that a failure leaves nothing behind."""
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,6 +64,23 @@ def test_a_pair_with_picture_and_page(transfer: Transfer, run: Path, tmp_path: P
     source, target = load_mesh("pose.obj"), load_mesh("person.obj")
     expected = PoseTransfer.from_run(run)(source=source, target=target)
     assert np.allclose(load_mesh(tmp_path / "posed.obj").vertices, expected.vertices, atol=1e-5)
+
+
+def test_files_of_any_name_are_taken_drawn_and_said(
+    transfer: Transfer, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bytes that are no UTF-8, mathematics, markup and a terminal's commands, in one name each."""
+    source = tmp_path / os.fsdecode(b"pose \xff $x^ <script> \x1b[31m.obj")
+    target = tmp_path / "$\\frac{$ =cmd \u202e.obj"
+    for name, place in (("pose.obj", source), ("person.obj", target)):
+        shutil.copy(run.parent / name, place)
+    out = tmp_path / os.fsdecode(b"posed \xfe\n.obj")
+    transfer(source, target, "-o", out, "--picture", "--viewer")
+    assert all(out.with_suffix(suffix).stat().st_size > 500 for suffix in (".obj", ".png", ".html"))
+    out_text, err_text = capsys.readouterr()
+    said = out_text + err_text
+    assert "\x1b" not in said and "\u202e" not in said and len(out_text.splitlines()) == 1
+    assert r"posed \udcfe\n.obj" in out_text and r"\x1b[31m" in out_text
 
 
 def test_both_ways_of_naming_the_meshes_are_one(transfer: Transfer, tmp_path: Path) -> None:
