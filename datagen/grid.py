@@ -76,32 +76,11 @@ class Grid:
 
     @property
     def identity_count(self) -> int:
-        return sum(self._members(split) for split in SPLITS)
+        return sum(step.training + step.evaluation for step in self.steps)
 
     @property
     def pose_count(self) -> int:
         return sum(step.seen + step.unseen for step in self.steps)
-
-    @property
-    def shard_count(self) -> int:
-        """Number of shards, from the recipe's counts alone: nothing is listed, however many they are."""
-        return sum(self._members(split) * -(-self._row_count(split) // self.rows_per_shard(split)) for split in SPLITS)
-
-    def _members(self, split: Split) -> int:
-        return sum(getattr(step, split) for step in self.steps)
-
-    def _row_count(self, split: Split) -> int:
-        """Rows of an array of a split's identities, holes included."""
-        rows, size = 0, self.rows_per_shard(split)
-        for step in self.steps:
-            count = self._poses_added(step, split)
-            rows = -(-rows // size) * size + count if count else rows
-        return rows
-
-    @staticmethod
-    def _poses_added(step: Growth, split: Split) -> int:
-        """Poses that a step gives to every identity of a split."""
-        return step.seen + (step.unseen if split == "evaluation" else 0)
 
     def split(self, identity: int) -> Split:
         """Which split identity number ``identity`` belongs to."""
@@ -146,8 +125,7 @@ class Grid:
     def _rows_in(self, split: Split) -> NDArray[np.int64]:
         rows: NDArray[np.int64] = np.empty(0, np.int64)
         first = 0
-        for step in self.steps:
-            count = self._poses_added(step, split)
+        for step, count in zip(self.steps, self._added(split), strict=True):
             if count:
                 holes = np.full(-len(rows) % self.rows_per_shard(split), HOLE, np.int64)
                 rows = np.concatenate([rows, holes, np.arange(first, first + count)])
@@ -156,7 +134,7 @@ class Grid:
 
     def rows_per_shard(self, split: Split) -> int:
         """Rows of a full shard: as the recipe says, but no more than the identities of a split had at first."""
-        return min(self.recipe.store.poses_per_shard, self._poses_added(self.steps[0], split))
+        return min(self.recipe.store.poses_per_shard, self._added(split)[0])
 
     def shards_of(self, identity: int) -> Iterator[Shard]:
         """Shards of one identity, in order; a shard never holds poses of two steps."""
@@ -170,8 +148,23 @@ class Grid:
         return [shard for identity in range(self.identity_count) for shard in self.shards_of(identity)]
 
     @property
+    def shard_count(self) -> int:
+        """How many shards there are; like the other counts it lists nothing, however large the grid."""
+        return sum(
+            self._identity_count(split) * sum(-(-count // self.rows_per_shard(split)) for count in self._added(split))
+            for split in SPLITS
+        )
+
+    @property
     def mesh_count(self) -> int:
-        return sum(len(self.poses_of(identity)) for identity in range(self.identity_count))
+        return sum(self._identity_count(split) * sum(self._added(split)) for split in SPLITS)
+
+    def _identity_count(self, split: Split) -> int:
+        return sum(getattr(step, split) for step in self.steps)
+
+    def _added(self, split: Split) -> list[int]:
+        """How many poses each step gives to the identities of a split."""
+        return [step.seen + (step.unseen if split == "evaluation" else 0) for step in self.steps]
 
     def evaluation_triples(self, pose_type: PoseType) -> NDArray[np.int32]:
         """The fixed evaluation list: rows of (source identity, source pose, target identity, target pose).
