@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from datagen.errors import DsffnetError
 from datagen.mesh import write_atomically
 from datagen.printable import printable
@@ -32,9 +34,9 @@ _ASK_SECONDS = 60.0  # that a cluster has to say whether its torch uses its GPUs
 def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
     """Train to the recipe's last step, or raise what stopped it.
 
-    With the launcher ``ray``, a rank that dies takes the others down and the group starts again from the newest
-    checkpoint: as often as it takes while there are new checkpoints, a few times where there are none. The recipe's
-    time budget counts from this call, restarts included.
+    The launcher ``auto`` is ``inline`` for one rank, else ``ray``. With ``ray``, a rank that dies takes the others down
+    and the group starts again from the newest checkpoint: as often as it takes while there are new checkpoints, a few
+    times where there are none. The recipe's time budget counts from this call, restarts included.
 
     Raises
     ------
@@ -43,9 +45,10 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
     DsffnetError
         Whatever :func:`training.trainer.train` raises.
     """
-    if recipe.launcher == "inline":
+    if recipe.launcher == "inline" or (recipe.launcher == "auto" and recipe.ranks == 1):
         _say("1 rank in this process", str(device_of(recipe, Ranks.from_environment())))
         train(recipe, data=data, run=run)
+        torch.cuda.empty_cache()  # what follows may run in other processes, and on the same GPU
     else:
         _with_ray(recipe, data, run)
 
@@ -84,8 +87,12 @@ def _group(recipe: TrainingRecipe, told: dict[str, Any], *, gpu: bool) -> Any:
     from ray.train import FailureConfig, RunConfig, ScalingConfig
     from ray.train.torch import TorchConfig, TorchTrainer
 
+    class Trainer(TorchTrainer):  # type: ignore[misc]
+        def _register_sigint_handler(self, controller: Any) -> None:
+            """Leave Ctrl-C as it is: Ray's handler outlives the training and exits with the status of a success."""
+
     storage = str(Path(told["run"]).resolve())
-    return TorchTrainer(
+    return Trainer(
         _rank,
         train_loop_config=told,
         torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
@@ -190,8 +197,6 @@ def _torch_there_uses_gpus() -> bool:
 
 
 def _sees_cuda() -> bool:
-    import torch
-
     return torch.cuda.is_available()
 
 

@@ -154,7 +154,10 @@ class TrainingRecipe(Frozen):
         ge=1,
         description="launcher ray: go on with so few when nodes are lost (elastic); default: as many as ranks",
     )
-    launcher: Literal["ray", "inline"] = Field("ray", description="ray: Ray Train; inline: this process, one rank")
+    launcher: Literal["auto", "ray", "inline"] = Field(
+        "auto",
+        description="ray: Ray Train; inline: this process, one rank; auto: inline for one rank, but on a cluster ray",
+    )
     precision: Literal["float32", "tf32", "bfloat16", "float64"] = Field(
         "float32",
         description="of the wide matrix products; norms, losses and weights stay float32; float64: all, for checks",

@@ -4,28 +4,20 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 from datagen.errors import ClusterError, RecipeError
 from datagen.printable import printable
-
-_ROOT = Path(__file__).resolve().parents[1]
-_OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
+from workflows.own_ray import own_ray
 
 
 def on_cluster() -> bool:
     """Whether this process belongs to a Ray cluster that it did not start."""
     return bool(os.environ.get("RAY_ADDRESS") or os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR"))
-
-
-if not on_cluster():
-    # Ray's own default for a cluster of ours. Ray reads it when it is first imported, and warns if it is not said.
-    os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
 def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
@@ -60,43 +52,34 @@ def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
 def ray_cluster() -> Iterator[None]:
     """A connected Ray; one that was started here is stopped at the end."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    if (
+        not on_cluster() and "ray" not in sys.modules
+    ):  # Ray's default here; it reads it at its import, and warns without
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
     import ray
 
     if ray.is_initialized():
         yield
         return
     before = signal.getsignal(signal.SIGTERM)
-    if on_cluster():
-        _require_head()
-        ray.init(logging_level=logging.WARNING)
-        _wait_for_cpus()
-    else:
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            object_store_memory=_OBJECT_STORE,
-            logging_level=logging.ERROR,
-            log_to_driver=False,  # errors of tasks and ranks reach the driver anyway; logs: /tmp/ray/session_latest
-            runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
-        )
-    try:
-        with _with_handler(before):
-            yield
-    finally:
-        ray.shutdown()
+    with _joined() if on_cluster() else own_ray():
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray's own lets it abort this process
+        yield
 
 
 @contextmanager
-def _with_handler(before: Any) -> Iterator[None]:
-    """Heed SIGTERM as before Ray was started, which lets it abort this process."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    rays = signal.signal(signal.SIGTERM, before)
+def _joined() -> Iterator[None]:
+    """The cluster that this process belongs to."""
+    import ray
+
+    _require_head()
+    ray.init(logging_level=logging.WARNING)
     try:
+        _wait_for_cpus()
         yield
     finally:
-        signal.signal(signal.SIGTERM, rays)
+        ray.shutdown()
 
 
 def _require_head() -> None:

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,22 +48,25 @@ class WorkflowError(DsffnetError):
 def guarded(main: Callable[[], None]) -> None:
     """Run a command; what a person can mend becomes one line on standard error and an exit status.
 
-    Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop.
+    Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop,
+    129: the terminal was closed.
     """
     logging.basicConfig(level=logging.WARNING)
     for handler in logging.getLogger().handlers:
         handler.setFormatter(_Printable("%(levelname)s: %(message)s"))
-    told = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: _interrupt(told))
+    told: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: _interrupt(told, number))
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, lambda number, _: _interrupt(told, number))
     try:
         main()
     except DsffnetError as error:
         print(f"error: {printable(error)}", file=sys.stderr)
         sys.exit(error.exit_status)
-    except KeyboardInterrupt:
-        word, status = ("stopped", 143) if told.is_set() else ("interrupted", 130)
-        print(f"{word}; run the same command again to go on from here", file=sys.stderr)
-        sys.exit(status)
+    except KeyboardInterrupt as interrupt:
+        what_next = str(interrupt) or "run the same command again to go on from here"
+        print(f"{'stopped' if told else 'interrupted'}; {what_next}", file=sys.stderr)
+        sys.exit(128 + (told[0] if told else signal.SIGINT))
     except OSError as error:
         log.debug("as raised", exc_info=True)
         print(f"error: {printable(error)}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
@@ -78,9 +80,9 @@ class _Printable(logging.Formatter):
         return printable_lines(super().format(record))
 
 
-def _interrupt(told: threading.Event) -> None:
+def _interrupt(told: list[int], number: int) -> None:
     """As Ctrl-C does: Ray's calls would turn a SystemExit into one of status 1."""
-    told.set()
+    told.append(number)
     raise KeyboardInterrupt
 
 
@@ -128,6 +130,11 @@ def add_set_option(made: argparse.ArgumentParser) -> None:
         metavar="section.key=value",
         help="change keys of the recipe, in any order",
     )
+
+
+def add_local_option(made: argparse.ArgumentParser) -> None:
+    """--local."""
+    made.add_argument("--local", action="store_true", help="all in this process, without Ray, however much it is")
 
 
 def add_tracking_option(made: argparse.ArgumentParser) -> None:

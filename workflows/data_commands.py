@@ -168,17 +168,14 @@ def stand_in_command(options: argparse.Namespace) -> None:
 
 @contextmanager
 def _runner(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Where tasks run (--local: here; otherwise on Ray) and what shows their progress."""
-    from datagen.generate import inline, ray_runner
-    from workflows.cluster import ray_cluster, require_reachable
+    """Where tasks run and what shows their progress."""
+    from workflows.cluster import require_reachable
     from workflows.pipeline import generation_bar
+    from workflows.tasks import TaskRunner
 
     options.out = require_reachable(options.out, option="--out", urls=True)
-    if options.local:
-        yield {"run": inline, "progress": generation_bar}
-    else:
-        with ray_cluster():
-            yield {"run": ray_runner, "progress": generation_bar}
+    with TaskRunner(local=options.local) as tasks:
+        yield {"run": tasks.make_shards, "progress": generation_bar}
 
 
 def _show(url: str) -> None:

@@ -25,9 +25,17 @@ from datagen.store.schema import open_group
 from training.record import read_record, update_record
 from training.report import NAMES, report_is_current, workflow_report
 from training.tracking import Mirror
-from workflows.cluster import ray_cluster, require_reachable
+from workflows.cluster import require_reachable
 from workflows.commands import print_text
-from workflows.console import alone_in, closing_words, guarded, server_of, start_over, workflow_parser
+from workflows.console import (
+    add_local_option,
+    alone_in,
+    closing_words,
+    guarded,
+    server_of,
+    start_over,
+    workflow_parser,
+)
 from workflows.pipeline import (
     check_run_accepts,
     evaluate_stage,
@@ -40,11 +48,14 @@ from workflows.pipeline import (
 )
 from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
 from workflows.stages import Stage, once, refuse_other_kind, run_stage
+from workflows.tasks import TaskRunner
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse, then run the stages while a mirror keeps MLflow up to date."""
-    options = workflow_parser(__doc__ or "").parse_args(arguments)
+    parser = workflow_parser(__doc__ or "")
+    add_local_option(parser)
+    options = parser.parse_args(arguments)
     recipe = load_recipe(options.recipe, options.set)
     name = Path(options.recipe).stem
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
@@ -55,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
             start_over(out)
         mirror.start()
         try:
-            run_workflow(recipe, out)
+            run_workflow(recipe, out, TaskRunner(local=options.local))
         finally:
             outage = mirror.close()
     print_text(closing_words(out, server))
@@ -63,31 +74,33 @@ def main(arguments: list[str] | None = None) -> None:
         raise outage
 
 
-def run_workflow(recipe: WorkflowRecipe, out: Path) -> None:
-    """All stages of a recipe into the folder ``out``; finished ones are skipped, without so much as starting Ray."""
+def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
+    """All stages of a recipe into the folder ``out``; finished ones are skipped, and Ray starts for a stage with much
+    to do.
+    """
     data, run = str(out / "dataset.zarr"), out / "run"
     sections = recipe.model_dump(mode="json")
     refuse_other_kind(out, "workflow")
     _refuse_conflicts(recipe, data, run)
     with ExitStack() as around:
-        begin = once(lambda: _begin(around, recipe, out))
+        begin = once(lambda: _begin(around, recipe, out, tasks))
         generate = Stage(
             "generate",
             depends_on=sections["data"],
             intact=lambda: is_complete(data),
-            work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out),
+            work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out, tasks=tasks),
         )
         train = Stage(
             "train",
             depends_on=[sections["data"], sections["training"]],
             intact=lambda: is_trained(recipe.training, data, run),
-            work=partial(train_stage, recipe.training, data, run, parent=out),
+            work=partial(train_stage, recipe.training, data, run, parent=out, tasks=tasks),
         )
         evaluate = Stage(
             "evaluate",
             depends_on=[sections["data"], sections["training"], sections["evaluation"]],
             intact=lambda: is_evaluated(recipe.evaluation, data, run),
-            work=partial(_evaluate, recipe, data, run, out),
+            work=partial(_evaluate, recipe, data, run, out, tasks),
         )
         for stage in (generate, train, evaluate):
             run_stage(stage, out=out, before=begin)
@@ -106,18 +119,18 @@ def _refuse_conflicts(recipe: WorkflowRecipe, data: str, run: Path) -> None:
         check_run_accepts(recipe.training, open_dataset(data), run)
 
 
-def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path) -> None:
-    """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a connected Ray."""
+def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
+    """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a place for tasks."""
     save_recipe(recipe, out / "recipe.yaml")
     parameters = recipe.model_dump(mode="json")
     around.enter_context(recorded(out, kind="workflow", name=out.name, parent=None, parameters=parameters))
     update_record(out, artifacts=["recipe.yaml"])
-    around.enter_context(ray_cluster())
+    around.enter_context(tasks)
 
 
-def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path) -> None:
+def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path, tasks: TaskRunner) -> None:
     """Evaluate, and give the parent record what a person wants to see first: table, pictures, main metrics."""
-    evaluate_stage(recipe.evaluation, data, run, parent=out)
+    evaluate_stage(recipe.evaluation, data, run, parent=out, tasks=tasks)
     evaluation = run / "evaluation"
     parent, child = read_record(out), read_record(evaluation)
     assert parent is not None and child is not None

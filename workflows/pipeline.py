@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from datagen.errors import DsffnetError
-from datagen.generate import generate, ray_runner
+from datagen.generate import generate
 from datagen.grid import Grid
 from datagen.mesh import bounding_box, write_atomically
 from datagen.recipe import DatasetRecipe
@@ -35,6 +35,7 @@ from workflows.console import alone_in
 from workflows.evaluated import evaluated
 from workflows.progress import bar, following, sampling
 from workflows.stages import say
+from workflows.tasks import TaskRunner
 
 _CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
 """Attributes that tell a dataset from all others, wherever it lies."""
@@ -71,11 +72,11 @@ def evaluation_bar(chunks: Iterable[list[Row]], total: int, done: int) -> Iterat
             yield rows
 
 
-def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Path | None) -> None:
-    """Make the dataset, with Ray tasks, and a contact sheet of it."""
+def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Path | None, tasks: TaskRunner) -> None:
+    """Make the dataset and a contact sheet of it."""
     with recorded(folder, kind="generate", name="generate", parent=parent, parameters=recipe.model_dump(mode="json")):
         with sampling(folder / "system.jsonl"):
-            dataset = generate(recipe, url, run=ray_runner, progress=generation_bar)
+            dataset = generate(recipe, url, run=tasks.make_shards, progress=generation_bar)
         write_atomically(folder / "dataset.json", json.dumps(describe(url), indent=1).encode())
         draw_contact_sheet(dataset, folder / "contact-sheet.png")
         statistics = dataset.attributes["statistics"]
@@ -87,22 +88,23 @@ def generate_stage(recipe: DatasetRecipe, url: str, *, folder: Path, parent: Pat
         )
 
 
-def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | None) -> None:
+def train_stage(recipe: TrainingRecipe, data: str, run: Path, *, parent: Path | None, tasks: TaskRunner) -> None:
     """Train to the recipe's last step, from the newest checkpoint if there is one."""
     dataset = open_dataset(data)
     check_run_accepts(recipe, dataset, run)
     about = recorded(run, kind="train", name="train", parent=parent, parameters=recipe.model_dump(mode="json"))
     with alone_in(run, ".driver.lock"), about:
-        _train(recipe, dataset, run)
+        _train(recipe, dataset, run, tasks)
 
 
-def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path, tasks: TaskRunner) -> None:
     artifacts = ["recipe.yaml", "provenance.json"]
     update_record(run, dataset=about_dataset(dataset), artifacts=artifacts)
     write_run_head(recipe, dataset, run)
     steps, per_epoch = last_step_of(recipe, dataset), order_of(recipe, dataset).steps_per_epoch
+    placed = tasks.training(recipe)
     with following(run / "metrics.jsonl", steps=steps, steps_per_epoch=per_epoch):
-        launch(recipe, data=dataset.url, run=run)
+        launch(placed, data=dataset.url, run=run)
     _say_where_meshes_were(run)
     reached = require_checkpoint(run)
     if not is_finished(reached, steps):
@@ -127,7 +129,13 @@ def _say_where_meshes_were(run: Path) -> None:
 
 
 def evaluate_stage(
-    recipe: EvaluationRecipe, data: str, place: Path, *, parent: Path | None, which: Which = "result"
+    recipe: EvaluationRecipe,
+    data: str,
+    place: Path,
+    *,
+    parent: Path | None,
+    tasks: TaskRunner,
+    which: Which = "result",
 ) -> str:
     """Measure a run or weights, write rows, tables, figures, meshes and viewer; returns the report."""
     dataset, what = open_dataset(data), evaluated(place, which)
@@ -139,7 +147,8 @@ def evaluate_stage(
     with alone_in(folder), about_run:
         with sampling(folder / "system.jsonl"):
             keep = folder / "measured"
-            rows = evaluate([method], data, recipe, tasks=ray_runner, keep=keep, progress=evaluation_bar)
+            runner = tasks.measure(dataset, recipe)
+            rows = evaluate([method], data, recipe, tasks=runner, keep=keep, progress=evaluation_bar)
         write_rows(rows, folder / "rows.csv")
         about = f"Weights of step {step:,} on {plain(Path(dataset.url).name)} ({dataset.uuid})."
         text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))

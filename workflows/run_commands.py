@@ -3,12 +3,12 @@
 import argparse
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 from datagen.errors import DatasetError
 from workflows.commands import Command, add_command, print_text
-from workflows.console import add_recipe_options, add_tracking_option, server_of, server_of_record
+from workflows.console import add_local_option, add_recipe_options, add_tracking_option, server_of, server_of_record
 from workflows.evaluated import which_checkpoint
 from workflows.recipe import load_recipe
 
@@ -16,9 +16,10 @@ from workflows.recipe import load_recipe
 def train_command(options: argparse.Namespace) -> None:
     """Train on a dataset into a run folder, or go on with a training."""
     from datagen.store import open_dataset
-    from workflows.cluster import ray_cluster, require_reachable
+    from workflows.cluster import require_reachable
     from workflows.console import alone_in, remove_run
     from workflows.pipeline import check_run_accepts, train_stage
+    from workflows.tasks import TaskRunner
 
     recipe = load_recipe(options.recipe, options.set).training
     run = Path(require_reachable(options.out, option="--out"))
@@ -27,8 +28,8 @@ def train_command(options: argparse.Namespace) -> None:
     if options.fresh:
         with alone_in(run, ".driver.lock"):
             remove_run(run)
-    with _mirrored(run, options), ray_cluster() if recipe.launcher == "ray" else nullcontext():
-        train_stage(recipe, data, run, parent=None)
+    with _mirrored(run, options), TaskRunner() as tasks:
+        train_stage(recipe, data, run, parent=None, tasks=tasks)
     out, data = shlex.quote(options.out), shlex.quote(options.data)
     print_text(f"trained: {options.out}. Next: dsffnet evaluate {out} --data {data}")
 
@@ -37,17 +38,18 @@ def evaluate_command(options: argparse.Namespace) -> None:
     """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run."""
     from datagen.store import open_dataset
     from training.record import read_record
-    from workflows.cluster import ray_cluster, require_reachable
+    from workflows.cluster import require_reachable
     from workflows.evaluated import evaluated
     from workflows.pipeline import evaluate_stage
+    from workflows.tasks import TaskRunner
 
     recipe = load_recipe(options.recipe, options.set).evaluation
     place = Path(require_reachable(options.run, option="RUN"))
     home, data = evaluated(place, options.checkpoint).home, require_reachable(options.data, option="--data", urls=True)
     open_dataset(data)
-    with _mirrored(home, options), ray_cluster():
+    with _mirrored(home, options), TaskRunner(local=options.local) as tasks:
         parent = home if read_record(home) else None
-        print_text(evaluate_stage(recipe, data, place, parent=parent, which=options.checkpoint))
+        print_text(evaluate_stage(recipe, data, place, parent=parent, tasks=tasks, which=options.checkpoint))
 
 
 def sync_command(options: argparse.Namespace) -> None:
@@ -105,6 +107,7 @@ def add_run_commands(commands: "argparse._SubParsersAction[argparse.ArgumentPars
     _add_checkpoint(evaluate)
     evaluate.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset")
     add_recipe_options(evaluate)
+    add_local_option(evaluate)
     add_tracking_option(evaluate)
 
     sync = add_command(commands, sync_command, _EXAMPLES[sync_command])

@@ -23,6 +23,7 @@ from workflows.recipe import save_recipe
 from workflows.stages import Stage, once, refuse_other_kind, run_stage, say
 from workflows.sweep_progress import SweepProgress
 from workflows.sweep_report import FILES, Result, best_of, results_of, write_report
+from workflows.tasks import TaskRunner
 from workflows.trial_runs import Outcome, Place, is_finished, prepare, ray_trials
 from workflows.trials import Sweep, Trial, varied_values, write_sweep
 
@@ -111,7 +112,7 @@ def generate_and_train(
         "generate",
         depends_on=sweep.recipe.data.model_dump(mode="json"),
         intact=lambda: is_complete(data),
-        work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out),
+        work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out, tasks=TaskRunner()),
     )
     run_stage(generate, out=out, before=begin)
     waiting = [trial for trial in sweep.trials if not is_finished(trial, data, out)]

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from datagen.generate import inline
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from training.checkpoint import export_weights, require_checkpoint
@@ -14,6 +13,7 @@ from training.trainer import train
 from workflows import pipeline
 from workflows.console import remove_run
 from workflows.evaluated import evaluated, which_checkpoint
+from workflows.tasks import TaskRunner
 
 RECIPE = EvaluationRecipe(triples=1, emd_points=8, examples=1)
 
@@ -46,17 +46,14 @@ def test_other_data_is_named(workflow: Path, spoilable: Path, monkeypatch: pytes
     assert evaluated(workflow, 4).folder(other).name == "evaluation-leg-step-4"
 
 
-def test_weights_without_a_journal_get_all_but_the_curve(
-    workflow: Path, dataset: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline, "ray_runner", inline)
+def test_weights_without_a_journal_get_all_but_the_curve(workflow: Path, dataset: str) -> None:
     export_weights(require_checkpoint(workflow / "run"), workflow / "exported")
     before = sorted((workflow / "run" / "checkpoints").rglob("*"))
     for place, folder, has_curve in (
         (workflow / "exported", workflow / "exported" / "evaluation", False),
         (workflow / "run" / "checkpoints" / "step-00000004", workflow / "run" / "evaluation-step-4", True),
     ):
-        assert "step" in pipeline.evaluate_stage(RECIPE, dataset, place, parent=None)
+        assert "step" in pipeline.evaluate_stage(RECIPE, dataset, place, parent=None, tasks=TaskRunner())
         assert (folder / "tables.md").exists() and (folder / "figures" / "examples.png").exists()
         assert (folder / "figures" / "training-curve.png").exists() == has_curve
     assert sorted((workflow / "run" / "checkpoints").rglob("*")) == before
@@ -78,5 +75,5 @@ def test_the_driver_says_where_meshes_were_kept(
 ) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "input.json").write_text('{"where": "memory (1 MB)"}')
-    pipeline.train_stage(tiny_training(), dataset, tmp_path / "run", parent=None)
+    pipeline.train_stage(tiny_training(), dataset, tmp_path / "run", parent=None, tasks=TaskRunner())
     assert "train: meshes were kept in " in capsys.readouterr().out

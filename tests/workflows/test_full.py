@@ -48,6 +48,17 @@ def longer(out: Path) -> tuple[str, ...]:
     return ("--set", *LONGER)
 
 
+def on_ray(out: Path) -> tuple[str, ...]:
+    """More meshes than are made without Ray, and little else."""
+    return ("--set", "data.poses.seen=700", "data.poses.unseen=400", "training.steps=20", "evaluation.triples=6")
+
+
+def wait_until_gone(processes: list[psutil.Process]) -> None:
+    """Ray's agents look for their node every few seconds."""
+    _, alive = psutil.wait_procs(processes, timeout=60)
+    assert not alive, [process.cmdline() for process in alive]
+
+
 def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 200) -> None:
     until = time.monotonic() + seconds
     while not happened():
@@ -213,14 +224,60 @@ def test_sigkill_of_the_driver_in_every_stage(undisturbed: Path, tmp_path: Path)
 
 def test_sigkill_of_ray_workers_while_generating(undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    process = start(out, *longer(out))
-    for count in (2, 12):
+    process = start(out, *on_ray(out))
+    for count in (2, 60):
         wait_for(lambda count=count: shards(out) >= count and bool(family(process, "ray::ensure_shard")), process)  # type: ignore[misc]
         for worker in family(process, "ray::ensure_shard"):
             worker.send_signal(signal.SIGKILL)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
-    assert_equal(out, undisturbed)
+    local = tmp_path / "local"
+    assert run(local, "--local", *on_ray(local))[0] == 0
+    assert tree_hash(out / "dataset.zarr") == tree_hash(local / "dataset.zarr")
+
+
+@pytest.mark.parametrize("server", ["gcs_server", "raylet"])
+@pytest.mark.parametrize("stage", ["generate", "train"])
+def test_sigkill_of_a_server_of_ray(stage: str, server: str, undisturbed: Path, tmp_path: Path) -> None:
+    """Ray by itself waits for a minute, and then ends the process in the middle of a line."""
+    out = tmp_path / "out"
+    arguments = on_ray(out) if stage == "generate" else longer(out)
+    process = start(out, *arguments)
+    wait_for(lambda: (shards(out) if stage == "generate" else trained_steps(out)) >= 30, process)
+    rays = family(process, "ray")
+    (victim,) = [child for child in rays if child.name() == server]
+    victim.kill()
+    began = time.monotonic()
+    output, _ = process.communicate(timeout=90)
+    assert process.returncode == 1 and time.monotonic() - began < 45, output
+    assert output.splitlines()[-1].startswith(f"error: Ray's {server} has died"), output
+    assert "Traceback" not in output
+    record = read_record(out / ("run" if stage == "train" else "generate"))
+    assert record is not None and record.status in ("FAILED", "KILLED")
+    wait_until_gone(rays)
+    status, output = run(out, *arguments)
+    assert status == 0, output
+    if stage == "train":
+        assert_equal(out, undisturbed)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGHUP, 129), (signal.SIGKILL, -9)])
+def test_nothing_of_ray_outlives_a_driver_that_is_ended_while_it_trains(
+    number: signal.Signals, status: int, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background has it ignored
+    process = start(out, *longer(out))
+    signal.signal(signal.SIGINT, before)
+    wait_for(lambda: trained_steps(out) >= 10, process)
+    rays = family(process, "ray")
+    assert len(rays) > 4
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=90)
+    assert process.returncode == status, output
+    if status > 0:
+        assert output.splitlines()[-1].endswith("run the same command again to go on from here"), output
+    wait_until_gone(rays)
 
 
 def test_sigkill_of_a_training_rank(undisturbed: Path, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def test_the_quickstart_is_what_the_readme_says() -> None:
     recipe = load_recipe("quickstart")
     assert recipe.data.identities.training == 16 and recipe.data.poses.seen >= 200
     assert recipe.data.identities.evaluation >= 8 and recipe.data.poses.unseen > 0
-    assert recipe.training.ranks == 2 and recipe.training.launcher == "ray"
+    assert recipe.training.ranks == 2 and recipe.training.launcher == "auto"
 
 
 def test_defaults_are_the_papers() -> None:

@@ -1,11 +1,14 @@
 """What a command does when it is told to stop while Ray works for it."""
 
+import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from workflows.console import guarded
 
 ROOT = Path(__file__).parents[2]
 WAITING = """
@@ -37,3 +40,34 @@ def test_a_command_that_waits_for_ray_is_stopped_with_its_own_status(told: signa
     _, said = process.communicate(timeout=60)
     assert process.returncode == status, said
     assert said.splitlines()[-1].endswith("run the same command again to go on from here")
+
+
+@pytest.mark.parametrize(
+    ("told", "status", "words"),
+    [(signal.SIGHUP, 129, "stopped"), (signal.SIGTERM, 143, "stopped"), (signal.SIGINT, 130, "interrupted")],
+)
+def test_a_closed_terminal_ends_a_command_as_the_other_signals_do(
+    told: signal.Signals, status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    numbers = (signal.SIGHUP, signal.SIGTERM, signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in numbers}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            guarded(lambda: os.kill(os.getpid(), told))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert ended.value.code == status
+    assert capsys.readouterr().err == f"{words}; run the same command again to go on from here\n"
+
+
+def test_nohup_is_heeded() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGTERM)}
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        guarded(lambda: os.kill(os.getpid(), signal.SIGHUP))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
