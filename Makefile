@@ -72,12 +72,7 @@ bench-gpu: $(READY) ## DSFFNet on a GPU: fast against literal form, share of the
 
 ui: export OUT := $(OUT)
 ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another port: UI_PORT=5001)
-	@[ -e "$$OUT/mlflow.db" ] || { echo "$$OUT/mlflow.db is not there yet: 'make run' makes it;" \
-	    "for another folder: make ui OUT=folder" >&2; exit 1; }
-	@echo "MLflow: http://127.0.0.1:$(UI_PORT)   (ready in some seconds; Ctrl-C ends it)"
-	@out="$$(CDPATH= cd -- "$$OUT" && pwd)"; \
-	MLFLOW_DISABLE_TELEMETRY=true $(BIN)/mlflow ui --host 127.0.0.1 --port $(UI_PORT) --workers 1 \
-	    --backend-store-uri "sqlite:///$$out/mlflow.db" --artifacts-destination "$$out/mlartifacts"
+	@$(BIN)/dsffnet ui "$$OUT" --port $(UI_PORT)
 
 # An environment that was ready is brought up to date in place; any other is made from nothing.
 # The lock (where there is flock) lets a second make wait, also for the pip of a make that was killed.

@@ -19,6 +19,8 @@ _GROUPS = {
         "add_study_commands",
     ),
     ("transfer",): ("workflows.transfer_command", "add_transfer"),
+    ("submit",): ("workflows.submit_command", "add_submit"),
+    ("ui",): ("workflows.ui_command", "add_ui"),
 }
 """Subcommands that are declared together -> module and function that declare them."""
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -199,8 +199,8 @@ def can_run_postgres() -> bool:
 
 
 @contextmanager
-def services_running() -> Iterator[Stack]:
-    """PostgreSQL (or SQLite where there is none), MLflow, a Ray head and one worker; all ended with the block."""
+def services_running(names: Sequence[str] = ("mlflow", "ray-head", "ray-worker")) -> Iterator[Stack]:
+    """These services, MLflow with PostgreSQL (or SQLite where there is none); all ended with the block."""
     # Ray's socket paths have a limit of 107 characters, which pytest's folders pass; and PostgreSQL's user must get in.
     folder = Path(tempfile.mkdtemp(prefix="dsf", dir="/tmp"))
     folder.chmod(0o755)
@@ -209,9 +209,9 @@ def services_running() -> Iterator[Stack]:
     stack = Stack(folder)
     try:
         with ExitStack() as running:
-            if can_run_postgres():
+            if "mlflow" in names and can_run_postgres():
                 running.enter_context(stack.postgres())
-            for service in ("mlflow", "ray-head", "ray-worker"):
+            for service in names:
                 running.enter_context(stack.running(service))
             yield stack
     finally:
