@@ -8,10 +8,11 @@ ENV PYTHONUNBUFFERED=1 \
     MLFLOW_DISABLE_TELEMETRY=true \
     RAY_USAGE_STATS_ENABLED=0
 
-# Empty volumes take the owner of the folder they are mounted on, so these two must exist and belong to the user.
+# Empty volumes take the owner of the folder they are mounted on, so these two must exist and belong to the user. The code does not:
+# what runs as that user, jobs among it, cannot change it.
 RUN useradd --uid 1000 --create-home dsffnet \
     && mkdir -p /app /data /artifacts \
-    && chown dsffnet:dsffnet /app /data /artifacts
+    && chown dsffnet:dsffnet /data /artifacts
 
 WORKDIR /app
 
@@ -24,6 +25,8 @@ RUN mkdir datagen training workflows && touch datagen/__init__.py training/__ini
     && pip install --constraint constraints.txt ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} \
         --requirement deploy/requirements.txt --editable ".[s3]"
 
-COPY --chown=dsffnet:dsffnet . .
+COPY . .
+# Files of a checkout made under a strict umask are the owner's alone.
+RUN chmod -R a+rX,go-w /app
 
 USER dsffnet

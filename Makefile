@@ -72,7 +72,7 @@ bench-gpu: $(READY) ## DSFFNet on a GPU: fast against literal form, share of the
 
 ui: export OUT := $(OUT)
 ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another port: UI_PORT=5001)
-	@$(BIN)/dsffnet ui "$$OUT" --port $(UI_PORT)
+	@$(BIN)/dsffnet ui --port $(UI_PORT) -- "$$OUT"
 
 # An environment that was ready is brought up to date in place; any other is made from nothing.
 # The lock (where there is flock) lets a second make wait, also for the pip of a make that was killed.

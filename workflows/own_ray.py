@@ -68,7 +68,7 @@ def _patience(seconds: float) -> Iterator[None]:
     """
     from ray._private import services
 
-    os.environ["RAY_gcs_server_port_wait_time_s"] = f"{seconds:.0f}"
+    os.environ["RAY_gcs_server_port_wait_time_s"] = f"{seconds:.0f}"  # noqa: SIM112  (the name that Ray reads)
 
     ask: Callable[..., Any] = services.get_node
     until = time.monotonic() + seconds

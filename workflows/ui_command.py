@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datagen.errors import DatasetError, DsffnetError
+from training.tracking_store import prepare_store, sqlite_server
 from workflows.commands import add_command
 
 _LOOK_SECONDS = 0.3
@@ -35,10 +36,11 @@ def ui_command(options: argparse.Namespace) -> None:
 
 
 def _server(database: Path, port: int) -> list[str]:
+    server = sqlite_server(database)
+    prepare_store(server)
     return [
         *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
-        *("--backend-store-uri", f"sqlite:///{database}"),
-        *("--artifacts-destination", str(database.parent / "mlartifacts")),
+        *("--backend-store-uri", server.uri, "--artifacts-destination", str(server.artifacts)),
     ]
 
 

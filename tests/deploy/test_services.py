@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from composefile import ROOT
-from processes import Stack, services_running
+from processes import Stack, can_run_postgres, services_running
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(1200)]
 
@@ -84,6 +84,48 @@ def test_mlflow_stores_artifacts_in_the_volume(stack: Stack) -> None:
     url = f"{stack.mlflow}/api/2.0/mlflow-artifacts/artifacts/probe/hello.json"
     ask(url, body={"hello": "world"}, method="PUT")
     assert json.loads((stack.folder / "artifacts" / "probe" / "hello.json").read_text()) == {"hello": "world"}
+
+
+@pytest.mark.skipif(not can_run_postgres(), reason="needs PostgreSQL's programs")
+def test_the_documented_backup_of_the_database_can_be_restored(stack: Stack) -> None:
+    ask(f"{stack.mlflow}/api/2.0/mlflow/experiments/create", body={"name": "to be kept"})
+    guide = (ROOT / "docs" / "cluster.md").read_text()
+    dump, restore = (re.search(rf"-T postgres ({name} [^<>]*)[<>]", guide) for name in ("pg_dump", "pg_restore"))
+    assert dump and restore
+
+    def postgres(command: str, **streams: Any) -> str:
+        program, *options = command.split()
+        words = [
+            str(Path(shutil.which("initdb") or "").resolve().with_name(program)),
+            "--host=127.0.0.1",
+            f"--port={stack.ports['5432']}",
+            *options,
+        ]
+        environment = stack.environment("mlflow")
+        return subprocess.run(words, env=environment, check=True, text=True, stdout=subprocess.PIPE, **streams).stdout
+
+    kept = stack.folder / "mlflow.dump"
+    dumped = dump[1].split()
+    postgres(" ".join([*dumped[:-1], f"--file={kept}", dumped[-1]]))
+    postgres("createdb --username=mlflow restored")
+    with kept.open("rb") as file:
+        postgres(restore[1].replace("--dbname=mlflow", "--dbname=restored"), stdin=file)
+    query = "SELECT name FROM experiments ORDER BY name"
+    both = [
+        postgres(f"psql --username=mlflow --dbname={name} --tuples-only --no-align --file=-", input=query)
+        for name in ("mlflow", "restored")
+    ]
+    assert both[0] == both[1] and "to be kept" in both[0].splitlines()
+
+
+def test_ray_job_submit_runs_the_same_job(stack: Stack) -> None:
+    """What people of Ray are used to."""
+    command = ["ray", "job", "submit", f"--address={stack.dashboard}", "--working-dir", ".", "--"]
+    done = subprocess.run(
+        [*command, "python", "workflows/full.py", "--help"],
+        cwd=ROOT, env=stack.environment("client"), capture_output=True, text=True, timeout=JOB_SECONDS, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "keys for --set" in done.stdout, done.stdout[-4000:] + done.stderr[-2000:]
 
 
 def test_ray_refuses_whoever_has_no_token(stack: Stack) -> None:
