@@ -44,6 +44,10 @@ class UnsafeFileError(DsffnetError):
     """A file named by a dataset, run or mesh that leads out of its folder, is no regular file, or is far too long."""
 
 
+class DamagedFileError(DsffnetError):
+    """A file that does not hold what is written to such a file (empty, cut short, garbage, of other types)."""
+
+
 def reason_of(error: BaseException) -> str:
     """Return what an exception says in one short line: the operating system's words, or its own."""
     words = str(getattr(error, "strerror", None) or error)

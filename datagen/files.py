@@ -4,12 +4,16 @@ A dataset, a run or a mesh that was downloaded says which files belong to it. Wh
 may lead out of its folder, a link may lead anywhere, and a device such as /dev/zero never ends.
 """
 
+import errno
 import os
 import stat
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 
-from datagen.errors import UnsafeFileError
+from datagen.errors import DamagedFileError, UnsafeFileError
+
+TEXT_LIMIT = 16 * 2**20
+"""Bytes of a text or JSON file of ours; the longest that are written have some hundred thousand."""
 
 
 def resolve_within(folder: Path, name: str) -> Path:
@@ -25,7 +29,7 @@ def resolve_within(folder: Path, name: str) -> Path:
         raise UnsafeFileError(f"{folder} names {name!r}, which is not a path inside it. Do not trust what it holds")
     root = Path(os.path.realpath(folder))
     path = Path(os.path.realpath(root / name))
-    if not path.is_relative_to(root):
+    if not path.is_relative_to(root) or path.is_symlink():  # what is a link still leads to itself
         raise UnsafeFileError(f"{folder} names {name!r}, a link that leads out of it. Do not trust what it holds")
     return path
 
@@ -63,3 +67,44 @@ def read_bounded(path: Path, *, limit: int) -> bytes:
     if len(content) > limit:
         raise UnsafeFileError(f"{path} is longer than the {limit:,} bytes that it can have ({size:,})")
     return content
+
+
+def read_within(folder: Path, name: str, *, limit: int = TEXT_LIMIT) -> bytes:
+    """Return the content of a regular file of at most ``limit`` bytes inside a folder.
+
+    Raises
+    ------
+    UnsafeFileError
+        It leads out of the folder, is not a regular file, or is longer than that.
+    OSError
+        It is not there, or cannot be read.
+    """
+    return read_bounded(resolve_within(folder, name), limit=limit)
+
+
+def read_text_within(folder: Path, name: str, *, limit: int = TEXT_LIMIT) -> str:
+    """Return the text of a UTF-8 file inside a folder; see :func:`read_within`.
+
+    Raises
+    ------
+    DamagedFileError
+        It is not UTF-8.
+    UnsafeFileError, OSError
+        As :func:`read_within` does.
+    """
+    try:
+        return read_within(folder, name, limit=limit).decode()
+    except UnicodeDecodeError as error:
+        raise DamagedFileError(f"{folder / name} is not a text in UTF-8 ({error.reason})") from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk has the names of a folder's files, where its file system can say so."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network file systems know no such thing
+            raise
+    finally:
+        os.close(descriptor)

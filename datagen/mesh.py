@@ -5,7 +5,7 @@ A person's own files, with all that is in them, are read and written by :mod:`da
 
 import io
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import MeshError, StorageError
+from datagen.files import sync_folder
 from datagen.obj import read_plain
 
 FORMATS = (".obj", ".ply", ".off", ".glb", ".stl")
@@ -194,14 +195,16 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+        temporary = path.parent / f".{path.name}.{secrets.token_hex(8)}.partial"
         try:
-            with os.fdopen(descriptor, "wb") as file:
+            with open(temporary, "xb") as file:  # not mkstemp, whose files nobody but the owner may read
                 yield file
-            os.chmod(temporary, 0o644)
+                file.flush()
+                os.fsync(file.fileno())  # renamed before its content is on the disk, a power failure leaves it empty
             os.replace(temporary, path)
         except BaseException:
-            os.unlink(temporary)
+            temporary.unlink(missing_ok=True)
             raise
+        sync_folder(path.parent)
     except OSError as error:
         raise StorageError(f"could not write {path}: {error.strerror or error}") from error

@@ -25,6 +25,12 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
             resolve_within(tmp_path / "folder", name)
 
 
+def test_a_link_that_leads_to_itself_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(UnsafeFileError, match="link"):
+        resolve_within(tmp_path, "loop")
+
+
 def test_a_folder_that_is_itself_reached_by_a_link_is_the_folder(tmp_path: Path) -> None:
     (tmp_path / "folder" / "a").mkdir(parents=True)
     (tmp_path / "other").symlink_to(tmp_path / "folder")
