@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from datagen.files import resolve_within
 from training.checkpoint import CheckpointError
 from training.figure_style import DPI, INK, PAGE, QUIET, RULE, saved
 from training.journal import read_journal
 from training.palette import method_colors
+from training.recipe_file import recipe_in
 from training.sweep_figures import PMD_UNIT, RunCurve, run_curve, spread
 
 _LEFT, _AXES, _HEIGHT, _TOP, _BOTTOM, _LETTER = 0.62, 3.7, 3.1, 0.52, 0.5, 0.068  # inches
@@ -61,7 +62,7 @@ def learning_of(name: str, run: Path) -> Learning:
         raise CheckpointError(
             f"{run} ({name}) is no folder of a run: it lacks metrics.jsonl or recipe.yaml. Train it first"
         )
-    batch = int(yaml.safe_load((run / "recipe.yaml").read_text(encoding="utf-8"))["batch"])
+    batch = recipe_in(resolve_within(run, "recipe.yaml")).batch
     loss, seen, unseen = (
         _drawable(run_curve(rows, key, batch=batch, name=name))
         for key in ("loss/reconstruction", "evaluation/pmd_seen", "evaluation/pmd_unseen")

@@ -16,7 +16,7 @@ from datagen.errors import DatasetError
 from datagen.store import Dataset
 from training.measuring import POSE_TYPES, Score
 from training.robustness import NO_OP, Case, case_of
-from training.row_files import read_csv, write_csv
+from training.row_files import kept_rows, write_csv
 from training.scores import LoadedMethod, mean_and_interval, normalised, transfer_each
 from training.tables import markdown
 
@@ -188,4 +188,4 @@ def write_rows(rows: Sequence[GeneralisationRow], path: Path) -> None:
 
 def read_rows(path: Path) -> list[GeneralisationRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return read_csv(path, GeneralisationRow) if path.exists() else []
+    return kept_rows(path, GeneralisationRow)

@@ -10,9 +10,18 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, Strict, TypeAdapter, ValidationError
 
 from datagen.errors import StorageError
+from datagen.files import open_regular, resolve_within
+from training.run_files import warn_once
+
+_Whole = Annotated[int, Field(strict=True, gt=-(2**63), lt=2**63)]
+_ROW: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, _Whole | Annotated[float, Strict()]])
+_MOST_STEPS, _LAST_SECOND = 2**53, 253_402_300_800  # the year 9999
+_LONGEST_LINE, _BLOCK = 2**20, 2**16  # bytes
 
 
 class Journal:
@@ -21,7 +30,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         _drop_torn_line(path)
-        self._path, self._last = path, max((row["step"] for row in read_journal(path)), default=-1)
+        self._path, self._last = path, max((row["step"] for _, row in journal_from(path, 0)), default=-1)
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - open for the whole run
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
@@ -68,30 +77,62 @@ class Journal:
 
 
 def read_journal(path: Path) -> list[dict[str, Any]]:
-    """All whole lines of a journal; an empty list where there is none."""
+    """All whole lines of a journal; an empty list where there is none.
+
+    Raises
+    ------
+    UnsafeFileError
+        It leads out of its folder, or is not a regular file.
+    """
     return [row for _, row in journal_from(path, 0)]
 
 
 def journal_from(path: Path, offset: int) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Whole lines from byte ``offset`` on, each with the offset just behind it."""
+    """Whole lines from byte ``offset`` on, each with the offset just behind it; garbage is left out, with a warning.
+
+    Raises
+    ------
+    UnsafeFileError
+        It leads out of its folder, or is not a regular file.
+    """
     if not path.exists():
         return
-    with open(path, "rb") as file:
+    with open_regular(resolve_within(path.parent, path.name)) as file:
         file.seek(offset)
-        for line in file:
-            if not line.endswith(b"\n"):
-                return
+        while (line := file.readline(_LONGEST_LINE)).endswith(b"\n"):
             offset += len(line)
-            yield offset, json.loads(line)
+            row = _row(line)
+            if row is not None:
+                yield offset, row
+            else:
+                warn_once(f"{path} holds lines that are no rows of a journal; they are left out")
+        if len(line) == _LONGEST_LINE:
+            warn_once(f"{path} is no journal from byte {offset:,} on, which is left out")
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    """Return a line's row: numbers by name, among them ``step`` and, where it was noted, ``time``."""
+    try:
+        row = _ROW.validate_json(line)
+    except ValidationError:
+        return None
+    is_dated = 0 <= row.get("time", 0) < _LAST_SECOND
+    return row if isinstance(row.get("step"), int) and 0 <= row["step"] < _MOST_STEPS and is_dated else None
 
 
 def _drop_torn_line(path: Path) -> None:
-    if path.exists():
-        content = path.read_bytes()
-        whole = content.rfind(b"\n") + 1
-        if whole < len(content):
-            with open(path, "r+b") as file:
-                file.truncate(whole)
+    """Cut off what is behind the last line's end."""
+    if not path.exists():
+        return
+    with open_regular(resolve_within(path.parent, path.name)) as file:
+        size = start = file.seek(0, os.SEEK_END)
+        found = -1
+        while start and found < 0:
+            start = max(0, start - _BLOCK)
+            file.seek(start)
+            found = file.read(_BLOCK).rfind(b"\n")
+    if start + found + 1 < size:
+        os.truncate(path, start + found + 1)
 
 
 def coefficient_metrics(network: object) -> dict[str, float]:

@@ -14,16 +14,21 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter
+from typing_extensions import TypedDict
 
 import torch
 
 from datagen.errors import DsffnetError
+from datagen.files import read_within
 from datagen.mesh import write_atomically
 from datagen.printable import printable
 from training.ranks import STOP_FILE, Ranks, TrainingError, TrainingStopped, device_of
 from training.recipe import TrainingRecipe
 from training.recipe_file import recipe_in
+from training.run_files import read_json_if_whole, set_aside
 from training.trainer import train
 
 log = logging.getLogger(__name__)
@@ -139,7 +144,7 @@ def _rank(config: dict[str, Any]) -> None:
     if (run / _FAILURE).exists():
         return
     try:
-        if not (run / _MARK).exists() or (run / _MARK).read_text() != config["mark"]:
+        if not (run / _MARK).exists() or read_within(run, _MARK) != config["mark"].encode():
             raise TrainingError(f"this rank does not see {run} as the driver does: --out must be on a disk they share")
         recipe = TrainingRecipe.model_validate(config["recipe"])
         train(recipe, data=config["data"], run=run, began=config["began"])
@@ -151,15 +156,24 @@ def _rank(config: dict[str, Any]) -> None:
 
 
 def _failure_of(run: Path) -> TrainingError | None:
-    """What a rank left for the driver to say, with its exit status."""
-    try:
-        about = json.loads((run / _FAILURE).read_text())
-    except FileNotFoundError:
+    """What a rank left for the driver to say, with its exit status; None where it left nothing that can be read."""
+    about = read_json_if_whole(run, _FAILURE, _LEFT)
+    if about is None:
+        set_aside(run / _FAILURE)
         return None
     (run / _FAILURE).unlink()
     failure = (TrainingStopped if about["stopped"] else TrainingError)(about["message"])
     failure.exit_status = about["status"]
     return failure
+
+
+class _Left(TypedDict):
+    message: str
+    status: Annotated[int, Field(gt=0, lt=256)]
+    stopped: bool
+
+
+_LEFT = TypeAdapter(_Left)
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """The card of a trained model: what its weights are, how they came about, what they score, where they end."""
 
-import hashlib
 import json
 import shlex
 from collections.abc import Sequence
@@ -12,17 +11,18 @@ import torch
 from datagen.store import Dataset
 from training.card_texts import MODEL_LIMITS, MODEL_USE, NETWORK_LIMITS, NETWORKS, as_yaml, name_of, span, vertex_counts
 from training.checkpoint import Checkpoint, require_checkpoint
-from training.checkpoint_folder import AVERAGE, WEIGHTS
+from training.checkpoint_folder import AVERAGE, WEIGHTS, sha256_of
 from training.earlier import recipe_of
 from training.evaluation import NO_OPS, POSE_TYPES, Row
 from training.inference import network_from
 from training.journal import read_journal
+from training.provenance import provenance_of
 from training.recipe import NptRecipe, TrainingRecipe
 from training.record import ALIAS, MODEL, flatten
 from training.report_blocks import Block, Code, Facts, Section, Table, Text
 from training.report_inline import plain
 from training.report_links import shown
-from training.report_origin import duration, provenance_of
+from training.report_origin import duration
 from training.sweep_figures import run_curve
 from training.tables import COLUMNS, mean_of, methods_of, summary
 
@@ -78,7 +78,7 @@ def _model_facts(
         "parameters": f"{count:,} ({count * 4 / 1024:,.0f} KiB in float32)",
         "weights": f"{weights.relative_to(home).as_posix() if home in weights.parents else weights.name}"
         f", step {checkpoint.step:,}",
-        "sha256 of the weights": Code(_sha256(weights)),
+        "sha256 of the weights": Code(sha256_of(weights)),
         "trained on": name_of(dataset) if checkpoint.dataset == dataset.uuid else "other data than this report's",
         "uuid of the data": Code(checkpoint.dataset or dataset.uuid),
         "steps": f"{checkpoint.step:,} of {recipe.batch} triples each",
@@ -156,11 +156,6 @@ def _parameter_count(recipe: TrainingRecipe) -> int:
 
 def _weights_file(folder: Path) -> Path:
     return folder / (AVERAGE if (folder / AVERAGE).exists() else WEIGHTS)
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _usage(home: Path) -> str:

@@ -1,14 +1,20 @@
 """Reading a training recipe from a file and words KEY=VALUE, on a machine that has only torch and pydantic."""
 
 import json
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from datagen.errors import RecipeError
+from datagen.errors import RecipeError, UnsafeFileError
+from datagen.files import read_bounded
 from training.recipe import TrainingRecipe
+
+_LONGEST = 2**20  # bytes
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 200
 
 
 def recipe_in(path: Path, words: Sequence[str] = ()) -> TrainingRecipe:
@@ -39,17 +45,17 @@ def recipe_in(path: Path, words: Sequence[str] = ()) -> TrainingRecipe:
 
 def _read(path: Path) -> Any:
     try:
-        text = path.read_text()
+        text = read_bounded(path, limit=_LONGEST).decode()
         if path.suffix == ".json":
             return json.loads(text)
         import yaml
     except ImportError as error:
         raise RecipeError(f"{path} needs PyYAML, which is not installed here. Give the recipe as JSON") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError, UnsafeFileError) as error:
         raise RecipeError(f"{path} cannot be read as a training recipe: {_line(error)}") from error
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date of month 13 is a ValueError
         raise RecipeError(f"{path} cannot be read as a training recipe: {_line(error)}") from error
 
 
@@ -80,13 +86,13 @@ def _set(values: dict[str, Any], word: str) -> None:
 def _value(text: str) -> Any:
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 
 def _described(fault: Any) -> str:
     key, message = ".".join(map(str, fault["loc"])), fault["msg"].removeprefix("Value error, ")
-    given = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
+    given = "" if isinstance(fault["input"], dict) else f" (given: {_SHORT.repr(fault['input'])})"
     return f"{key}: {message}{given}" if key else f"{message}{given}"
 
 

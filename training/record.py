@@ -14,12 +14,17 @@ import time
 import uuid
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import Any, Literal
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from datagen.mesh import write_atomically
+from training.run_files import read_json_if_whole, set_aside
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
+Milliseconds = Annotated[int, Field(ge=0, lt=253_402_300_800_000)]
+"""Since 1970, to the year 9999: what a date can be made of."""
 FILE = "record.json"
 EXPERIMENT = "dsffnet"
 MODEL, ALIAS = "dsffnet", "latest-trained"
@@ -35,12 +40,16 @@ class Server:
 
 @dataclass(frozen=True)
 class Record:
-    """One run as MLflow will show it. ``parent`` and ``artifacts`` are paths relative to the record's folder.
+    """One run as MLflow will show it.
 
+    ``parent`` leads from the record's folder up to the folder of its parent: ``..``, ``../..``; see :func:`parent_of`.
+    ``artifacts`` are names of files and folders inside the record's folder.
     ``id`` is unique; servers are asked for it before a run is created, so that none is created twice.
     ``model`` is the registered name of the run's weights; it is registered again when ``model_version`` changes.
     ``measured`` is when ``metrics`` changed, and times are in milliseconds since 1970.
     """
+
+    __pydantic_config__: ClassVar = ConfigDict(strict=True, extra="forbid")
 
     name: str
     kind: str
@@ -52,31 +61,44 @@ class Record:
     model: str | None = None
     model_version: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
-    measured: int | None = None
+    measured: Milliseconds | None = None
     status: Status = "RUNNING"
-    started: int = 0
-    ended: int | None = None
+    started: Milliseconds = 0
+    ended: Milliseconds | None = None
     id: str = ""
 
 
+_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
+
+
 def read_record(folder: Path) -> Record | None:
-    """The record of a folder, None where there is none."""
-    path = folder / FILE
-    return Record(**json.loads(path.read_text())) if path.exists() else None
+    """The record of a folder; None where there is none or, with a warning, an unreadable one."""
+    return read_json_if_whole(folder, FILE, _RECORD)
+
+
+def has_record(folder: Path) -> bool:
+    """Whether a folder holds a readable record."""
+    return read_record(folder) is not None
 
 
 def write_record(folder: Path, record: Record) -> None:
     """Write a record; it appears whole or not at all."""
-    write_atomically(folder / FILE, json.dumps(asdict(record), indent=1).encode())
+    text = json.dumps(asdict(record), indent=1, ensure_ascii=False)
+    write_atomically(folder / FILE, text.encode(errors="replace"))  # a path need not be UTF-8, a record must be
 
 
 def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, parameters: dict[str, str]) -> Record:
-    """Begin a record, or go on with the one that is there (its start time and its id stay)."""
+    """Begin a record, or go on with the one that is there (its start time and its id stay).
+
+    An unreadable one is set aside. ``parent`` is kept where it holds ``folder``; a record elsewhere stands alone.
+    """
     before = read_record(folder)
+    if before is None:
+        set_aside(folder / FILE)
     record = Record(
         name=name,
         kind=kind,
-        parent=os.path.relpath(parent, folder) if parent else None,
+        parent=_way_up(folder, parent) if parent else None,
         parameters=parameters,
         tags=_tags() if parent else _tags() | {"dsffnet.command": _command()},
         started=before.started if before else _now(),
@@ -99,14 +121,21 @@ def end_record(folder: Path, status: Status) -> None:
     update_record(folder, status=status, ended=_now())
 
 
+def parent_of(folder: Path, record: Record) -> Path | None:
+    """The folder of a record's parent: one that holds the record's own; None where it names none or another."""
+    steps = PurePosixPath(record.parent or "").parts
+    above = Path(os.path.realpath(folder)).parents
+    return above[len(steps) - 1] if set(steps) == {".."} and len(steps) <= len(above) else None
+
+
 def find_records(root: Path) -> list[Path]:
     """Folders below ``root`` that hold a record, and those of their parents, parents first."""
-    found = {folder.resolve() for folder in _with_records(root)}
-    for folder in list(found):
-        record = read_record(folder)
-        if record and record.parent and read_record((folder / record.parent).resolve()):
-            found.add((folder / record.parent).resolve())
-    return sorted(found, key=lambda folder: (_has_parent(folder), _start_of(folder)))
+    records = {folder.resolve(): read_record(folder) for folder in _with_records(root)}
+    for folder, record in list(records.items()):
+        parent = parent_of(folder, record) if record else None
+        if parent and parent not in records and (its := read_record(parent)):
+            records[parent] = its
+    return sorted(records, key=lambda folder: _rank(records[folder]))
 
 
 def _with_records(root: Path) -> Iterator[Path]:
@@ -128,14 +157,17 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
-def _has_parent(folder: Path) -> bool:
-    record = read_record(folder)
-    return record is not None and record.parent is not None
+def _rank(record: Record | None) -> tuple[bool, int]:
+    """Parents before children, and by their starts."""
+    return (record is not None and record.parent is not None, record.started if record else 0)
 
 
-def _start_of(folder: Path) -> int:
-    record = read_record(folder)
-    return record.started if record else 0
+def _way_up(folder: Path, parent: Path) -> str | None:
+    try:
+        below = Path(os.path.realpath(folder)).relative_to(os.path.realpath(parent))
+    except ValueError:
+        return None
+    return "/".join([".."] * len(below.parts)) or None
 
 
 def _tags() -> dict[str, str]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from datagen.files import read_text_within
 from datagen.mesh import write_atomically
 from datagen.printable import printable_lines
 from datagen.store import Dataset, open_dataset
@@ -152,7 +153,7 @@ def report_of_sweep(out: Path) -> tuple[Path, Path]:
             f"{out} holds no sweep (no {missing}). Begin one: dsffnet sweep --trials networks --out {out}"
         )
     dataset = open_dataset(str(out / "dataset.zarr"))
-    results = (*document_blocks(table.read_text(encoding="utf-8")), *pictures_of(out / "figures"))
+    results = (*document_blocks(read_text_within(out, table.name)), *pictures_of(out / "figures"))
     sections = [
         Section("Results", results),
         what_was_run(out),
@@ -180,7 +181,8 @@ def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]
 
 def _tables(path: Path) -> tuple[Block, ...]:
     """The tables of an evaluation, with its definitions as it wrote them; the best values are marked."""
-    return tuple(_marked(block) if isinstance(block, Table) else block for block in document_blocks(path.read_text()))
+    blocks = document_blocks(read_text_within(path.parent, path.name))
+    return tuple(_marked(block) if isinstance(block, Table) else block for block in blocks)
 
 
 def _marked(table: Table) -> Table:

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import html
+import os
 import re
 import struct
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from string import Template
 
+from datagen.files import read_within
 from training.report_blocks import (
     Block,
     Code,
@@ -39,6 +41,9 @@ KINDS = {
 
 _BROAD = 900
 """Pixels from which on a picture is scrolled on a narrow screen, instead of being made too small to read."""
+
+_LARGEST = 64 * 2**20
+"""Bytes of a picture."""
 
 _NUMBER = ' class="number"'
 _SHORT = 26
@@ -101,7 +106,7 @@ def _block(block: Block, folder: Path) -> str:
         case Table():
             return _table(block)
         case Picture():
-            return _picture(block)
+            return _picture(block, folder)
         case Page():
             return _page(block, folder)
         case Facts():
@@ -158,8 +163,8 @@ def _begins_group(lines: Sequence[Sequence[str]]) -> list[bool]:
     return [grouped and place > 0 and first != firsts[place - 1] for place, first in enumerate(firsts)]
 
 
-def _picture(picture: Picture) -> str:
-    content, size = _embedded(picture.path)
+def _picture(picture: Picture, folder: Path) -> str:
+    content, size = _embedded(picture.path, folder)
     caption = f"<figcaption>{inline_html(picture.caption)}</figcaption>" if picture.caption else ""
     text = html.escape(inline_text(picture.caption) or picture.path.stem)
     drawn = f'<img src="{content}" alt="{text}"{_size(size)}>'
@@ -172,13 +177,13 @@ def _size(size: tuple[int, int] | None) -> str:
     return f' width="{size[0]}" height="{size[1]}"' if size else ""
 
 
-def _embedded(path: Path) -> tuple[str, tuple[int, int] | None]:
-    """A picture as a data URL, and width and height in pixels where it is a PNG."""
+def _embedded(path: Path, folder: Path) -> tuple[str, tuple[int, int] | None]:
+    """A picture inside a report's folder as a data URL, and width and height in pixels where it is a PNG."""
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise ReportError(f"{path} is no picture that a report can show; formats are {', '.join(KINDS)}")
     try:
-        content = path.read_bytes()
+        content = read_within(folder, os.path.relpath(path, folder), limit=_LARGEST)
     except OSError as error:
         raise ReportError(
             f"the report wants picture {path}, which cannot be read ({error.strerror}). Run the stage that draws it"

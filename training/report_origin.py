@@ -1,7 +1,6 @@
 """What was run: command, commit, versions, machine, and the stages with their times, from the records in a folder."""
 
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -11,14 +10,20 @@ import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import psutil
+from pydantic import Field, TypeAdapter
+from typing_extensions import TypedDict
 
+from datagen.errors import DamagedFileError, UnsafeFileError
+from datagen.files import read_text_within
 from training.journal import read_journal
+from training.provenance import Provenance, provenance_of
 from training.record import Record, find_records, read_record
 from training.report_blocks import Block, Code, Facts, ReportError, Section, Table
 from training.report_links import shown
+from training.run_files import read_json
 
 COMMAND_TAG = "dsffnet.command"
 """The tag of a record that holds the command line, where it was noted."""
@@ -38,9 +43,8 @@ def what_was_run(out: Path) -> Section:
     if record is None:
         raise ReportError(f"{out} holds no record.json, so nothing was run there. Name the folder of a workflow")
     body: list[Block] = [Facts(_facts(record, out)), _stages(out)]
-    recipe = out / "recipe.yaml"
-    if recipe.is_file():
-        body.append(Code(recipe.read_text(encoding="utf-8"), folded="The whole recipe (recipe.yaml)"))
+    with suppress(FileNotFoundError):
+        body.append(Code(read_text_within(out, "recipe.yaml"), folded="The whole recipe (recipe.yaml)"))
     return Section("What was run", tuple(body))
 
 
@@ -64,13 +68,6 @@ def this_commit() -> str:
     return f"{commit} with local changes" if _git("status", "--porcelain", "--untracked-files=no") else commit
 
 
-def provenance_of(run: Path) -> dict[str, Any]:
-    """What a training noted of its software, machine and data (RUN/provenance.json); empty where it did not."""
-    with suppress(OSError, ValueError):
-        return dict(json.loads((run / "provenance.json").read_text()))
-    return {}
-
-
 def moment(milliseconds: float) -> str:
     """A time since 1970 as people write it, in UTC."""
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(milliseconds / 1000))
@@ -91,7 +88,7 @@ def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:
     script = Path(record.tags.get("mlflow.source.name", "workflows/full.py"))
     script_name = f"{script.parent.name}/{script.name}" if script.suffix == ".py" else script.name
     packages = {name: _version(name) for name in _PACKAGES}
-    noted = next(filter(None, map(provenance_of, _below(out))), {})
+    noted = next(filter(None, map(provenance_of, _below(out))), Provenance())
     commit, hardware = noted.get("git_commit"), noted.get("hardware")
     facts: dict[str, str | int | float | Code] = {"name": f"{record.name} ({record.kind})"}
     if command:
@@ -179,10 +176,17 @@ def _seconds(record: Record, out: Path) -> float | None:
     if record.ended is None:
         return None
     mark = out / "stages" / f"{record.name}.json"
-    with suppress(OSError, ValueError, KeyError):
+    with suppress(OSError, DamagedFileError, UnsafeFileError):
         if mark.stat().st_mtime * 1000 >= record.ended:
-            return float(json.loads(mark.read_text())["seconds"])
+            return read_json(out, f"stages/{record.name}.json", _SECONDS)["seconds"]
     return _between(record.started, record.ended)
+
+
+class _Seconds(TypedDict):
+    seconds: Annotated[float, Field(ge=0, lt=1e12)]
+
+
+_SECONDS = TypeAdapter(_Seconds)
 
 
 def _version(package: str) -> str:

@@ -18,7 +18,7 @@ from datagen.mesh import Mesh, bounding_box
 from datagen.store import Dataset
 from training.disturbances import DISTURBANCES, Disturbance
 from training.measuring import NO_OPS, POSE_TYPES, Score
-from training.row_files import read_csv, write_csv
+from training.row_files import kept_rows, write_csv
 from training.scores import LoadedMethod, normalised, score, transfer_each
 
 NO_OP = NO_OPS[0]
@@ -184,4 +184,4 @@ def write_rows(rows: Sequence[RobustnessRow], path: Path) -> None:
 
 def read_rows(path: Path) -> list[RobustnessRow]:
     """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return read_csv(path, RobustnessRow) if path.exists() else []
+    return kept_rows(path, RobustnessRow)

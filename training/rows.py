@@ -1,11 +1,11 @@
 """Rows of an evaluation (one a triple and method) as CSV, and finished pieces of one kept for its next start."""
 
-import csv
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.errors import DamagedFileError, UnsafeFileError
 from training.row_files import read_csv, write_csv
 
 _PIECE = re.compile(r"(seen|unseen)-\d{5,}-[0-9a-f]{32}\.csv")
@@ -40,7 +40,7 @@ def write_rows(rows: list[Row], path: Path) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a CSV that :func:`write_rows` wrote."""
+    """Rows of a CSV that :func:`write_rows` wrote; see :func:`training.row_files.read_csv`."""
     return read_csv(path, Row)
 
 
@@ -53,7 +53,7 @@ def read_piece(path: Path, expected: list[tuple[str, str, int]]) -> list[Row] | 
     """Rows of a kept piece; None if it is missing, damaged, or not of these (method, pose type, triple)."""
     try:
         rows = read_rows(path)
-    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+    except (OSError, DamagedFileError, UnsafeFileError):
         return None
     return rows if [(row.method, row.pose_type, row.triple) for row in rows] == expected else None
 

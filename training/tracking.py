@@ -24,9 +24,10 @@ from typing import Any
 from filelock import FileLock
 
 from datagen.errors import DsffnetError
+from datagen.files import read_within, resolve_within
 from datagen.printable import printable, printable_lines
 from training.outbox import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
-from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, read_record
+from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, parent_of, read_record
 from training.tracking_store import prepare_store
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
@@ -102,6 +103,8 @@ def _publish_record(client: Any, server: Server, folder: Path, failures: list[Ex
         if error.error_code in _NO_ANSWER:
             raise
         failures.append(error)
+    except (DsffnetError, ArithmeticError, ValueError, LookupError, TypeError) as error:  # it holds what none can send
+        failures.append(error)
 
 
 class _Publication:
@@ -168,10 +171,10 @@ class _Publication:
 
     def _create_run(self, experiment: str) -> None:
         tags = {"kind": self.record.kind, _RECORD_TAG: self._id}
-        if self.record.parent:
-            known = read_sent((self.folder / self.record.parent).resolve(), self.server.uri)
-            if known:  # a run that was copied away from its workflow stands alone
-                tags[_PARENT_TAG] = known["run"]
+        parent = parent_of(self.folder, self.record)
+        known = read_sent(parent, self.server.uri) if parent else {}
+        if known:  # a run that was copied away from its workflow stands alone
+            tags[_PARENT_TAG] = known["run"]
         name = printable(self.record.name)[:_LONGEST_NAME]
         self.client.create_run(experiment, start_time=self.record.started, run_name=name, tags=tags)
 
@@ -234,8 +237,7 @@ class _Publication:
 
     def _send_artifacts(self) -> None:
         for path, name, stamp in unsent_artifacts(self.folder, self.record.artifacts, self.sent["artifacts"]):
-            folder = "" if name.startswith("..") else os.path.dirname(name)
-            self.client.log_artifact(self.sent["run"], str(path), folder or None)
+            self.client.log_artifact(self.sent["run"], str(path), os.path.dirname(name) or None)
             self.sent["artifacts"][name] = stamp
             self._note()
 
@@ -269,11 +271,13 @@ class _Publication:
         from training.checkpoint import export_weights, require_checkpoint
 
         checkpoint = require_checkpoint(self.folder, "result")
+        resolve_within(self.folder, os.path.relpath(checkpoint.path, self.folder))  # no other run's weights are sent
         packages = [Path(__file__).parent, Path(__file__).parents[1] / "datagen"]
         with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
             export_weights(checkpoint, Path(temporary) / "weights")
             with suppress(FileNotFoundError):  # what bodies it learned from, for training.unlikeness
-                shutil.copy(self.folder / "provenance.json", Path(temporary) / "weights")
+                about = read_within(self.folder, "provenance.json")
+                (Path(temporary) / "weights" / "provenance.json").write_bytes(about)
             code = [str(shutil.copytree(p, Path(temporary) / p.name, ignore=_NO_CACHES)) for p in packages]
             model = mlflow.pyfunc.log_model(
                 name="model",

@@ -5,7 +5,6 @@ that noted nothing it is asked of the dataset that they name, while it is still 
 by what holds for any.
 """
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from datagen.errors import DatasetError, StorageError
+from datagen.errors import DsffnetError
 from datagen.mesh import Mesh, bounding_box, edges_of
 from training.alignment import Axes, Orientation, axes_as_options
+from training.provenance import FILE, Provenance, provenance_of
 
 if TYPE_CHECKING:
     from datagen.store import Dataset
@@ -62,17 +62,19 @@ def seen_by(weights: Path) -> Seen | None:
     """What the network of a run saw, None where it cannot be had; ``weights`` is a checkpoint's folder or file."""
     try:
         about = _provenance(weights)
-        return _from_note(about["seen"]) if "seen" in about else _seen_at(about["dataset"]["url"])
-    except (OSError, ValueError, TypeError, KeyError, DatasetError, StorageError):  # half a dataset or note is none
+        seen = about.get("seen")
+        if seen is None and "seen" in about:
+            return None
+        return _from_note(seen) if seen is not None else _seen_at(about["dataset"]["url"])
+    except (OSError, OverflowError, ValueError, TypeError, KeyError, DsffnetError):  # half a dataset or note is none
         return None
 
 
-def _provenance(weights: Path) -> dict[str, Any]:
+def _provenance(weights: Path) -> Provenance:
     start = weights.absolute()
     for folder in (start, *start.parents):
-        about = folder / "provenance.json"
-        if about.is_file():
-            return dict(json.loads(about.read_text()))
+        if (folder / FILE).exists():
+            return provenance_of(folder)
         if folder not in (start, start.parent) and folder.name != "checkpoints":
             break
     raise KeyError("provenance")

@@ -1,6 +1,5 @@
 """Datasets of many kinds of meshes in the same poses: Anny's topologies, the stand-in in SMPL's format, animals."""
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from datagen.recipe import (
 from datagen.standins import write_standin
 from datagen.store import Dataset, open_dataset
 from training.generalisation import Kind
+from training.provenance import provenance_of
 
 Other = Literal["smpl", "animals"]
 TOPOLOGIES: tuple[AnnyTopology, ...] = (
@@ -49,7 +49,7 @@ class Sizes:
 def own_recipe(home: Path) -> DatasetRecipe | None:
     """The recipe of the dataset that a run was trained on: beside the run, or where it was then; None where neither."""
     try:
-        about = json.loads((home / "provenance.json").read_text())["dataset"]
+        about = provenance_of(home)["dataset"]
         found = (_recipe_at(url, about["uuid"]) for url in (str(home.parent / "dataset.zarr"), about["url"]))
         return next(filter(None, found), None)
     except (OSError, ValueError, KeyError):

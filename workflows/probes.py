@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from datagen.errors import RecipeError
+from datagen.errors import RecipeError, UnsafeFileError
+from datagen.files import read_within
 from datagen.mesh import write_atomically
 from datagen.printable import printable
 from training.evaluation import fingerprint_of
@@ -106,11 +107,14 @@ def sync_words(folder: Path) -> str:
 
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
     """Whether a folder's rows were measured with these settings; from now on the folder's rows are."""
-    path, text = folder / _SETTINGS, json.dumps(settings, indent=1, sort_keys=True)
-    same = path.exists() and path.read_text() == text
+    text = json.dumps(settings, indent=1, sort_keys=True).encode()
+    try:
+        same = read_within(folder, _SETTINGS) == text
+    except (FileNotFoundError, UnsafeFileError):
+        same = False
     if not same:
         (folder / "rows.csv").unlink(missing_ok=True)
-        write_atomically(path, text.encode())
+        write_atomically(folder / _SETTINGS, text)
     return same
 
 

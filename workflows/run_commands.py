@@ -54,12 +54,12 @@ def evaluate_command(options: argparse.Namespace) -> None:
 
 def sync_command(options: argparse.Namespace) -> None:
     """Send to MLflow what an outage kept back; repeating it changes nothing."""
-    from training.record import find_records
+    from training.record import find_records, has_record
     from training.tracking import publish
     from workflows.console import server_of_record
 
     run = Path(options.run)
-    records = find_records(run) if run.is_dir() else []
+    records = [folder for folder in find_records(run) if has_record(folder)] if run.is_dir() else []
     if not records:
         raise DatasetError(f"{run} holds no record of a run. Name the folder that a workflow or training wrote to")
     server = server_of_record(records[0], options.tracking_uri)
@@ -130,10 +130,10 @@ def _add_checkpoint(made: argparse.ArgumentParser) -> None:
 @contextmanager
 def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
     """Keep MLflow up to date with a run folder while the block runs; an outage is an error only at the end."""
-    from training.record import find_records, read_record
+    from training.record import find_records, has_record
     from training.tracking import Mirror
 
-    recorded = [folder for folder in find_records(run) if read_record(folder)]
+    recorded = [folder for folder in find_records(run) if has_record(folder)]
     server = (
         server_of_record(recorded[0], options.tracking_uri) if recorded else server_of(run.parent, options.tracking_uri)
     )

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from datagen.errors import ClusterError, DsffnetError
+from datagen.files import read_within
 from datagen.mesh import write_atomically
 from datagen.store import open_dataset
 from training.launch import launch
@@ -178,7 +179,7 @@ def _inherited(out: Path) -> dict[str, str]:
 
 def _require_shared_disk(place: Place) -> None:
     mark = place.out / _MARK
-    if not mark.exists() or mark.read_text() != place.mark:
+    if not mark.exists() or read_within(place.out, _MARK) != place.mark.encode():
         raise WorkflowError(f"this trial does not see {place.out} as the driver does: --out must be on a shared disk")
 
 

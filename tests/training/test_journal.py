@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from datagen.errors import StorageError
+from datagen.errors import StorageError, UnsafeFileError
 from tests.support.disk import small_disk
 from training.journal import Journal, coefficient_metrics, journal_from, read_journal
 from training.networks import build_network
@@ -39,6 +39,53 @@ def test_a_torn_last_line_is_dropped_and_written_again(tmp_path: Path) -> None:
     journal.write(2, {"loss": 2.0})
     journal.close()
     assert [row["step"] for row in read_journal(path)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"garbage", b"null", b"[1]", b"\xff\xfe", bytes(100), b'{"time": 1}', b'{"step": "x"}', b'{"step": -1}',
+        b'{"step": 2, "loss": "low"}', b'{"step": 1' + b"0" * 30 + b"}", b'{"step": 2, "time": 1e300}', b"[" * 5000,
+        b'{"step": 2, "loss": {}}', b'{"step": true}',
+    ],
+)  # fmt: skip
+def test_a_line_of_garbage_is_left_out_with_one_warning(
+    tmp_path: Path, line: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "m.jsonl"
+    path.write_bytes(b'{"step": 1, "time": 0}\n' + (line + b"\n") * 2 + b'{"step": 3, "time": 0}\n')
+    assert [row["step"] for row in read_journal(path)] == [1, 3]
+    journal = Journal(path)
+    journal.write(4, {"loss": 1.0})
+    journal.close()
+    assert [row["step"] for row in read_journal(path)] == [1, 3, 4] and len(caplog.messages) == 1
+
+
+def test_a_long_torn_end_is_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "m.jsonl"
+    for whole in (b"", b'{"step": 1, "time": 0}\n'):
+        path.write_bytes(whole + bytes(200_000))
+        Journal(path).close()
+        assert path.read_bytes() == whole
+
+
+def test_what_has_no_lines_is_not_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "m.jsonl"
+    with path.open("wb") as file:
+        file.write(b'{"step": 1, "time": 0}\n')
+        file.truncate(2**40)  # a terabyte without a line's end
+    assert [row["step"] for row in read_journal(path)] == [1]
+
+
+def test_a_journal_elsewhere_is_neither_read_nor_written(tmp_path: Path) -> None:
+    other, path = tmp_path / "other", tmp_path / "run" / "m.jsonl"
+    other.write_bytes(b'{"step": 1, "time": 0}\ntorn')
+    path.parent.mkdir()
+    path.symlink_to(other)
+    for opened in (read_journal, Journal):
+        with pytest.raises(UnsafeFileError, match="link that leads out of it"):
+            opened(path)
+    assert other.read_bytes().endswith(b"torn")
 
 
 def test_reading_from_an_offset_goes_on_where_it_was(tmp_path: Path) -> None:

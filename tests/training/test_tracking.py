@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from training.record import (
     flatten,
     read_record,
     update_record,
+    write_record,
 )
 from training.tracking import Mirror, TrackingError, publish
 from training.trainer import train
@@ -92,6 +94,97 @@ def test_a_clock_that_was_put_back_gives_no_run_that_ends_before_it_began(root: 
     child = runs_of(server)["train"]
     assert child.info.end_time >= child.info.start_time == started
     assert [step for step, _ in history(server, child, "loss/total")] == [1, 2, 3, 4, 5, 6]
+
+
+def artifacts_of(server: Server, run: Any, folder: str | None = None) -> set[str]:
+    found = mlflow.MlflowClient(server.uri).list_artifacts(run.info.run_id, folder)
+    files = {its.path for its in found if not its.is_dir}
+    return files.union(*(artifacts_of(server, run, its.path) for its in found if its.is_dir))
+
+
+def test_nothing_outside_the_folder_of_a_record_is_sent(
+    root: Path, server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = root / "run"
+    for secret in (root.parent / "secret", root / "secret"):
+        secret.write_text("secret")
+    (run / "figures" / "linked.png").symlink_to(root.parent / "secret")
+    (run / "figures" / "below").symlink_to(root.parent)
+    (run / "figures" / "inside.png").symlink_to("curve.png")
+    (run / "figures" / "device").symlink_to("/dev/zero")
+    os.mkfifo(run / "figures" / "pipe")
+    (run / "elsewhere").symlink_to(root.parent)
+    (run / "system.jsonl").symlink_to(root.parent / "other.jsonl")
+    (root.parent / "other.jsonl").write_text('{"step": 1, "time": 1, "secret": 42}\n')
+    hostile = [
+        "../../secret",
+        "../secret",
+        str(root.parent / "secret"),
+        "/etc/hostname",
+        "elsewhere",
+        "elsewhere/secret",
+    ]
+    update_record(run, artifacts=[*hostile, "figures"])
+    for _ in range(2):
+        publish(root, server)
+    child = runs_of(server)["train"]
+    assert artifacts_of(server, child) == {"figures/curve.png", "figures/inside.png"}
+    assert "secret" not in child.data.metrics
+    for name in (*hostile, "figures/linked.png", "figures/device", "system.jsonl"):
+        assert sum(f" names {name!r}, " in line for line in caplog.messages) == 1, name
+
+
+@pytest.mark.parametrize(
+    "parent", ["../../other", "../run/../..", "/", "{other}", "../../../../../../../../../../../.."]
+)
+def test_a_parent_that_does_not_hold_the_record_is_neither_read_nor_sent(
+    root: Path, server: Server, parent: str
+) -> None:
+    other = root.parent / "other"
+    begin_record(other, name="other", kind="workflow", parent=None, parameters={})
+    publish(other, server)
+    write_record(root / "run", replace(read_record(root / "run"), parent=parent.format(other=other)))
+    begin_record(other, name="changed", kind="workflow", parent=None, parameters={"secret": "1"})
+    assert find_records(root / "run") == [root / "run"]
+    publish(root / "run", server)
+    runs = runs_of(server)
+    assert set(runs) == {"other", "train"} and "secret" not in runs["other"].data.params
+    assert "mlflow.parentRunId" not in runs["train"].data.tags
+
+
+def test_the_weights_of_another_run_are_not_registered(root: Path, server: Server, dataset: str) -> None:
+    train(tiny_training(steps=4), data=dataset, run=root.parent / "private")
+    (root / "run" / "run").symlink_to(root.parent / "private")
+    update_record(root / "run", model="dsffnet")
+    end_record(root / "run", "FINISHED")
+    with pytest.raises(TrackingError, match="link that leads out of it"):
+        publish(root, server)
+    assert not mlflow.MlflowClient(server.uri).search_registered_models()
+
+
+@pytest.mark.parametrize("note", [b"", b"null", b'{"uri": {"run": 5}}'])
+def test_an_unreadable_note_is_set_aside_and_nothing_is_sent_twice(
+    root: Path, server: Server, note: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    publish(root, server)
+    before = {name: run.info.run_id for name, run in runs_of(server).items()}
+    (root / "run" / "mlflow.json").write_bytes(note)
+    publish(root, server)
+    client = mlflow.MlflowClient(server.uri)
+    found = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
+    assert {run.info.run_name: run.info.run_id for run in found} == before and len(found) == 2
+    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
+    assert (root / "run" / "mlflow.json.unreadable").read_bytes() == note
+    assert sum("mlflow.json is unreadable" in line for line in caplog.messages) == 1
+
+
+def test_an_unreadable_record_of_one_stage_keeps_back_no_other(root: Path, server: Server) -> None:
+    (root / "run" / "record.json").write_bytes(b"{")
+    publish(root, server)
+    assert set(runs_of(server)) == {"quick"}
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    publish(root, server)
+    assert set(runs_of(server)) == {"quick", "train"}
 
 
 def test_repeating_changes_nothing(root: Path, server: Server) -> None:
