@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datagen.errors import DamagedFileError
+from datagen.files import resolve_within
 from datagen.mesh import write_atomically
 from training.checkpoint_folder import (
     AVERAGE,
@@ -35,9 +37,11 @@ from training.checkpoint_folder import (
     is_listed,
     manifest_of,
     newest_first,
+    step_folder,
     weights_writer,
     write_manifest,
 )
+from training.state_file import read_state
 from training.weights import CheckpointError, cast_weights, read_header, read_weights
 
 __all__ = [
@@ -82,7 +86,7 @@ class Checkpoint:
         if self.path.is_file():
             return read_weights(self.path)
         has_average = average and (self.path / AVERAGE).exists()
-        return read_weights(self.path / (AVERAGE if has_average else WEIGHTS))
+        return read_weights(resolve_within(self.path, AVERAGE if has_average else WEIGHTS))
 
     def state(self) -> dict[str, Any]:
         """State of the optimiser, the schedule and whatever else training goes on from.
@@ -90,11 +94,11 @@ class Checkpoint:
         Raises
         ------
         CheckpointError
-            These are weights only.
+            These are weights only, or what is beside them is no state of a training.
         """
         if not (self.path / STATE).is_file():
             raise CheckpointError(f"{self.path} holds weights only, which training can start from but not go on from")
-        return dict(torch.load(self.path / STATE, map_location="cpu", weights_only=True))
+        return read_state(self.path, STATE)
 
 
 def save_checkpoint(
@@ -125,7 +129,7 @@ def save_checkpoint(
     StorageError
         It could not be written; earlier checkpoints are untouched.
     """
-    final = run / "checkpoints" / f"step-{about['step']:08d}"
+    final = step_folder(run, f"step-{about['step']:08d}")
     if fault_of(final) is not None:
         writers: dict[str, Writer] = {
             WEIGHTS: weights_writer(weights, about),
@@ -159,7 +163,7 @@ def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
     if which in ("latest", "result"):
         found = _newest_sound(run)
         return load_checkpoint(run, "best") or found if which == "result" and _was_cut_short(found) else found
-    path = best_of(run) if which == "best" else run / "checkpoints" / f"step-{which:08d}"
+    path = best_of(run) if which == "best" else step_folder(run, f"step-{which:08d}")
     return _named(path) if path else None
 
 
@@ -190,7 +194,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """
     try:
         return _checkpoint(path, manifest_of(path))
-    except (OSError, ValueError) as error:
+    except (OSError, DamagedFileError) as error:
         raise CheckpointError(f"checkpoint {path} cannot be read: {error}. --out must be on a shared disk") from error
 
 

@@ -1,25 +1,34 @@
-"""The folder of a checkpoint on the disk: committed at once, hashed, checked, forgotten. See training.checkpoint."""
+"""The folder of a checkpoint on the disk: committed at once, hashed, checked, forgotten. See training.checkpoint.
+
+What a manifest or RUN/best names is read inside its own folder only.
+"""
 
 import functools
 import hashlib
 import json
 import os
+import re
+import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from pydantic import ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
-from datagen.errors import storage_errors
+from datagen.errors import DamagedFileError, UnsafeFileError, storage_errors
+from datagen.files import open_regular, read_within, resolve_within, sync_folder
 from datagen.mesh import write_atomically
-from training.weights import write_weights
+from training.run_files import fault_in, warn_once
+from training.weights import About, about_in, write_weights
 
 WEIGHTS, AVERAGE, STATE, MANIFEST = "weights.safetensors", "average.safetensors", "state.pt", "manifest.json"
 BEST, LATEST = "best", "latest"
+_STEP = re.compile(r"step-\d{8,15}")
 Writer = Callable[[Path], None]
 
 
@@ -38,7 +47,8 @@ def commit(final: Path, about: Mapping[str, Any], writers: Mapping[str, Writer])
     """
     with _writing(final):
         final.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(dir=final.parent, prefix=".partial-"))
+        temporary = final.parent / f".partial-{secrets.token_hex(8)}"
+        temporary.mkdir()  # not mkdtemp, whose folders nobody but the owner may read
         try:
             _write(temporary, about, writers)
             shutil.rmtree(final, ignore_errors=True)  # a damaged one
@@ -46,7 +56,7 @@ def commit(final: Path, about: Mapping[str, Any], writers: Mapping[str, Writer])
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
-        _sync(final.parent)
+        sync_folder(final.parent)
 
 
 def commit_into(folder: Path, about: Mapping[str, Any], writers: Mapping[str, Writer]) -> None:
@@ -63,6 +73,7 @@ def commit_into(folder: Path, about: Mapping[str, Any], writers: Mapping[str, Wr
             _write(Path(temporary), about, writers)
             for name in (*writers, MANIFEST):
                 os.replace(Path(temporary) / name, folder / name)
+        sync_folder(folder)
 
 
 def _writing(place: Path) -> AbstractContextManager[None]:
@@ -71,9 +82,28 @@ def _writing(place: Path) -> AbstractContextManager[None]:
     return storage_errors(f"checkpoint {place}", advice="Earlier checkpoints are kept", also=also)
 
 
+class _Manifest(About):
+    sha256: dict[Literal["weights.safetensors", "average.safetensors", "state.pt"], str]
+    manifest_sha256: str | None = None
+
+
 def manifest_of(path: Path) -> dict[str, Any]:
-    """The manifest of a checkpoint, read as it is."""
-    return dict(json.loads((path / MANIFEST).read_text()))
+    """The manifest of a checkpoint, read as it is.
+
+    Raises
+    ------
+    DamagedFileError
+        It is no JSON object with values of a manifest's types, or nested too deep.
+    UnsafeFileError
+        It leads out of the folder, is not a regular file, or is far too long.
+    OSError
+        It is not there, or cannot be read.
+    """
+    content = read_within(path, MANIFEST)
+    try:
+        return about_in(content, _Manifest)
+    except ValidationError as error:
+        raise DamagedFileError(f"{MANIFEST} is unreadable: {fault_in(error)}") from error
 
 
 def is_listed(path: Path) -> bool:
@@ -100,10 +130,10 @@ def fault_of(path: Path, *, only: str | None = None, once: bool = False) -> str 
         if manifest.get("manifest_sha256", _seal(manifest)) != _seal(manifest):
             return f"{MANIFEST} is not as it was written"
         for name, digest in manifest["sha256"].items():
-            if only in (None, name) and (_sha256_once if once else _sha256)(path / name) != digest:
+            if only in (None, name) and (_sha256_once if once else sha256_of)(resolve_within(path, name)) != digest:
                 return f"sha256 of {name} differs from its manifest"
     except _UNREADABLE as error:
-        return f"{type(error).__name__}: {error}"
+        return str(error)
     return None
 
 
@@ -113,14 +143,37 @@ def best_of(run: Path) -> Path | None:
     The manifests decide, for a kill may come before RUN/best is moved; RUN/best counts where a manifest is unreadable.
     """
     marked = [path for path in newest_first(run) if _is_marked_best(path)][:1]
-    if (run / BEST).exists():
-        marked.append(run / "checkpoints" / (run / BEST).read_text().strip())
-    return max(marked, default=None)
+    return max((*marked, *_named_best(run)), default=None)
+
+
+def checkpoints_of(run: Path) -> Path:
+    """RUN/checkpoints.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is a link that leads out of the run.
+    """
+    resolve_within(run, "checkpoints")
+    return run / "checkpoints"
+
+
+def step_folder(run: Path, name: str) -> Path:
+    """RUN/checkpoints/NAME.
+
+    Raises
+    ------
+    UnsafeFileError
+        It leads out of RUN/checkpoints.
+    """
+    resolve_within(checkpoints_of(run), name)
+    return run / "checkpoints" / name
 
 
 def newest_first(run: Path) -> Iterator[Path]:
-    """Folders of a run's checkpoints, sound or not."""
-    yield from sorted((run / "checkpoints").glob("step-*"), reverse=True)
+    """Folders of a run's checkpoints, sound or not; links are none."""
+    folders = (path for path in checkpoints_of(run).glob("step-*") if not path.is_symlink())
+    yield from sorted(folders, reverse=True)
 
 
 def forget_old(run: Path, keep: int) -> None:
@@ -128,21 +181,19 @@ def forget_old(run: Path, keep: int) -> None:
     sound = [path for path in newest_first(run) if fault_of(path, once=True) is None]
     for path in set(newest_first(run)) - {*sound[:keep], best_of(run)}:
         shutil.rmtree(path, ignore_errors=True)
-    for path in (run / "checkpoints").glob(".partial-*"):
+    for path in checkpoints_of(run).glob(".partial-*"):
         shutil.rmtree(path, ignore_errors=True)
 
 
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What a missing, cut or flipped manifest can lead to."""
+_UNREADABLE = (OSError, DamagedFileError, UnsafeFileError)
+"""What a missing, cut, flipped or made up manifest can lead to."""
 
 
 def _write(folder: Path, about: Mapping[str, Any], writers: Mapping[str, Writer]) -> None:
     for name, write in writers.items():
         write(folder / name)
-    manifest = {**about, "sha256": {name: _sha256(folder / name) for name in writers}}
-    write_manifest(folder, manifest)
-    for path in (*(folder / name for name in writers), folder / MANIFEST, folder):
-        _sync(path)
+        _sync(folder / name)
+    write_manifest(folder, {**about, "sha256": {name: sha256_of(folder / name) for name in writers}})
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
@@ -151,11 +202,24 @@ def _seal(manifest: Mapping[str, Any]) -> str:
 
 
 def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    with open_regular(path) as file:
+        os.fsync(file.fileno())
+
+
+def _named_best(run: Path) -> Iterator[Path]:
+    """The checkpoint that RUN/best names, if it names one; what else it holds is said and left out."""
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        name = read_within(run, BEST, limit=_LONGEST_NAME).decode().strip()
+        if not _STEP.fullmatch(name):
+            raise DamagedFileError(f"{run / BEST} names {name[:80]!r}, which is no checkpoint")
+        yield step_folder(run, name)
+    except FileNotFoundError:
+        return
+    except (UnicodeDecodeError, DamagedFileError, UnsafeFileError) as error:
+        warn_once(f"{error}. The manifests of the checkpoints say which is the best")
+
+
+_LONGEST_NAME = 1000  # bytes
 
 
 def _is_marked_best(path: Path) -> bool:
@@ -165,8 +229,15 @@ def _is_marked_best(path: Path) -> bool:
         return False
 
 
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
+def sha256_of(path: Path) -> str:
+    """Return the sha256 of a regular file, read in pieces.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is not a regular file.
+    """
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -178,4 +249,4 @@ def _sha256_once(path: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _known_sha256(path: Path, *looks: int) -> str:
-    return _sha256(path)
+    return sha256_of(path)

@@ -47,7 +47,8 @@ def state_of(checkpoint: Checkpoint, *, averaged: bool) -> dict[str, Any]:
     """
     state = checkpoint.state()
     parts = {"optimiser", "schedule", "random", "verdict"} | ({"averaged"} if averaged else set())
-    if not (parts <= state.keys() and "step" in state["schedule"]):
+    schedule = state.get("schedule")
+    if not (parts <= state.keys() and isinstance(schedule, Mapping) and "step" in schedule):
         raise CheckpointError(
             f"{checkpoint.path} was written by an earlier version, which this one cannot go on from; "
             f"begin from its weights: --set training.start_from={checkpoint.path}, in another --out"

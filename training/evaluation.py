@@ -19,7 +19,7 @@ from datagen.grid import PoseType
 from datagen.store import Dataset, open_dataset
 from training import paper
 from training.checkpoint import Checkpoint, require_checkpoint
-from training.checkpoint_folder import AVERAGE, WEIGHTS, manifest_of
+from training.checkpoint_folder import AVERAGE, WEIGHTS, manifest_of, sha256_of
 from training.earlier import recipe_of
 from training.measuring import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
 from training.recipe import CoreNet3dRecipe, EvaluationRecipe, NetworkRecipe, NptRecipe
@@ -194,8 +194,7 @@ def fingerprint_of(checkpoint: Checkpoint) -> str:
 def _hashes(weights: Path) -> dict[str, str]:
     if weights.is_dir():
         return {name: its for name, its in manifest_of(weights)["sha256"].items() if name in (WEIGHTS, AVERAGE)}
-    with open(weights, "rb") as file:
-        return {WEIGHTS: hashlib.file_digest(file, "sha256").hexdigest()}
+    return {WEIGHTS: sha256_of(weights)}
 
 
 def _pieces(dataset: Dataset, contenders: Sequence[Contender], recipe: EvaluationRecipe) -> list[_Piece]:

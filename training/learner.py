@@ -25,7 +25,7 @@ from training.inference import load_weights, network_from
 from training.losses import transfer_loss
 from training.networks.elain import iterated_once
 from training.networks.mixed_counts import MixedCounts
-from training.optimisation import WeightAverage, build_optimiser, build_schedule
+from training.optimisation import WeightAverage, build_optimiser, build_schedule, load_optimiser
 from training.ranks import Ranks
 from training.recipe import TrainingRecipe
 from training.weights import fill_network
@@ -104,16 +104,9 @@ class Learner:
         return state | ({"averaged": self.average.state_dict()["updates"]} if self.average else {})
 
     def load(self, found: Checkpoint, state: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint and its state.
-
-        The groups of the optimiser keep the implementation that was chosen here: a step that is not finite is left out
-        by the fused one alone.
-        """
-        ours = [{name: group[name] for name in ("fused", "foreach")} for group in self.optimiser.param_groups]
-        theirs = state["optimiser"]
-        groups = [group | chosen for group, chosen in zip(theirs["param_groups"], ours, strict=True)]
+        """Go on from a checkpoint and its state."""
         fill_network(self.network, found.weights(), where=str(found.path))
-        self.optimiser.load_state_dict({**theirs, "param_groups": groups})
+        load_optimiser(self.optimiser, state["optimiser"])
         self.schedule.load_state_dict(state["schedule"])
         if self.average:
             self.average.load_state_dict({"updates": state["averaged"], "weights": found.weights(average=True)})

@@ -39,6 +39,35 @@ def build_optimiser(network: nn.Module, recipe: TrainingRecipe) -> torch.optim.O
     )
 
 
+def load_optimiser(optimiser: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
+    """Go on from the moments in an optimiser's state; its hyperparameters stay those of the recipe.
+
+    So does the fused form, which alone leaves out a step that is not finite.
+
+    Raises
+    ------
+    ValueError
+        They are not those of the parameters.
+    """
+    optimiser.load_state_dict({"state": state["state"], "param_groups": optimiser.state_dict()["param_groups"]})
+    for parameter, moments in optimiser.state.items():
+        if not (isinstance(parameter, Tensor) and moments.keys() == _MOMENTS and _fit(moments, parameter)):
+            raise ValueError("the optimiser's state is that of other parameters")
+
+
+_MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
+"""What Adam and AdamW keep of a parameter."""
+
+
+def _fit(moments: Mapping[str, Any], parameter: Tensor) -> bool:
+    return all(
+        isinstance(value, Tensor)
+        and value.layout == torch.strided
+        and value.shape == (torch.Size() if name == "step" else parameter.shape)
+        for name, value in moments.items()
+    )
+
+
 def build_schedule(
     optimiser: torch.optim.Optimizer, recipe: TrainingRecipe, *, steps_per_epoch: int, steps: int
 ) -> Schedule:
@@ -122,8 +151,14 @@ class Schedule:
         return {"step": self._done}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on from there. The optimiser's own state, if any, must be loaded before."""
-        self._done = state["step"]
+        """Go on from there. The optimiser's own state, if any, must be loaded before.
+
+        Raises
+        ------
+        ValueError
+            It holds no number of steps.
+        """
+        self._done = _counted(state["step"])
         self._set()
 
     def _set(self) -> None:
@@ -182,13 +217,19 @@ class WeightAverage:
         Raises
         ------
         ValueError
-            The state is of another network.
+            The state is of another network, or holds no number of updates.
         """
         if state["weights"].keys() != self.weights.keys():
             other = sorted(state["weights"].keys() ^ self.weights.keys())
             raise ValueError(f"averaged weights of another network: {other[0]} is in one of the two only")
-        self._updates = state["updates"]
+        self._updates = _counted(state["updates"])
         _copy_into(self.weights, state["weights"])
+
+
+def _counted(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{type(value).__name__} instead of a number of steps")
+    return value
 
 
 def _copy(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

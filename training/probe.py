@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from datagen.errors import DatasetError
@@ -19,6 +20,7 @@ from training.journal import coefficient_metrics
 from training.metrics import point_mesh_distance
 from training.rasteriser import Integers
 from training.recipe import TrainingRecipe
+from training.run_files import fault_in
 from training.snapshots import draw_snapshot
 from training.triples import Triples
 
@@ -45,8 +47,17 @@ class Verdict:
 
     @classmethod
     def resumed(cls, state: Mapping[str, Any], *, triples: int) -> "Verdict":
-        """The verdict of a checkpoint; a best over other triples is no measure of these, and is forgotten."""
-        found = cls(**state)
+        """The verdict of a checkpoint; a best over other triples is no measure of these, and is forgotten.
+
+        Raises
+        ------
+        ValueError
+            It is none.
+        """
+        try:
+            found = TypeAdapter(cls).validate_python(dict(state))
+        except ValidationError as error:
+            raise ValueError(f"no verdict: {fault_in(error)}") from error
         if found.triples in (None, triples):
             return replace(found, triples=triples)
         log.info("evaluate_triples was %s and is %s: the best PMD so far is forgotten", found.triples, triples)

@@ -48,6 +48,7 @@ from training.ranks import (
 from training.recipe import TrainingRecipe, budget_seconds
 from training.resume import checkpoint_to_go_on_from, weights_to_begin_from
 from training.snapshots import snapshot_path
+from training.state_file import unusable_state
 from training.triples import last_step_of, order_of
 
 log = logging.getLogger(__name__)
@@ -286,10 +287,13 @@ class _Trainer:
 
     def _go_on_from(self, found: Checkpoint) -> None:
         state = state_of(found, averaged=self.recipe.average is not None)
-        self.learner.load(found, state)
-        restore_random_state(state["random"], self.ranks.rank)
+        try:
+            self.learner.load(found, state)
+            restore_random_state(state["random"], self.ranks.rank)
+            self.verdict = Verdict.resumed(state["verdict"], triples=self.recipe.evaluate_triples)
+        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise unusable_state(found.path, f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
         self.done, self.finished = found.step, found.finished
-        self.verdict = Verdict.resumed(state["verdict"], triples=self.recipe.evaluate_triples)
 
     def _stopped_early(self) -> None:
         where = f"at step {self.done} of {self.last_step}"

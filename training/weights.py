@@ -7,29 +7,53 @@ without such a header, load as well; then safetensors' own checks are all there 
 
 import hashlib
 import json
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from datagen.errors import DsffnetError
+from datagen.files import open_regular
+from training.run_files import fault_in
 
 _HEADER, _NAMED_AT_MOST = "dsffnet", 3
+_LONGEST_HEADER = 16 * 2**20  # bytes; those of our networks have some ten thousand
+_MOST_STEPS = 2**53
 
 
 class CheckpointError(DsffnetError):
     """A run without a usable checkpoint, a damaged one, or one that does not belong to what is asked."""
 
 
+class About(BaseModel):
+    """What a checkpoint's manifest and the header of its weights say, of the types that they say it in."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    step: Annotated[int, Field(ge=0, lt=_MOST_STEPS)] = 0
+    recipe: dict[str, Any] = {}
+    dataset: str = ""
+    dataset_sha256: str = ""
+    versions: dict[str, str] = {}
+    best: bool = False
+    finished: bool = False
+    last_step: Annotated[int, Field(ge=0, lt=_MOST_STEPS)] | None = None
+
+
 def write_weights(path: Path, weights: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
     """Write weights by parameter name, and what they are, into one safetensors file."""
     plain = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
     header = json.dumps({**about, "tensors_sha256": _digest(plain)})
+    path.touch()
+    mode = path.stat().st_mode  # as the umask says; safetensors' own files nobody but the owner may read
     save_file(plain, path, metadata={_HEADER: header})  # one key: with more their order, and so the bytes, would vary
+    path.chmod(stat.S_IMODE(mode))
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
@@ -39,11 +63,14 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     ------
     CheckpointError
         The file is missing, cut short, or no safetensors.
+    UnsafeFileError
+        It is not a regular file.
     """
     try:
+        _require_short_header(path)
         return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be read as weights: {error}. Name a sound checkpoint") from error
+    except _UNREADABLE as error:
+        raise _unreadable(path, str(error)) from error
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -53,16 +80,50 @@ def read_header(path: Path) -> dict[str, Any]:
     ------
     CheckpointError
         The file is missing or damaged: its tensors are not those that were written.
+    UnsafeFileError
+        It is not a regular file.
     """
     try:
+        _require_short_header(path)
         with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get(_HEADER, "{}"))
-    except (OSError, SafetensorError, ValueError) as error:
-        raise CheckpointError(f"{path} cannot be read as weights: {error}. Name a sound checkpoint") from error
+            text = (file.metadata() or {}).get(_HEADER, "{}")
+        header = about_in(text.encode())
+    except ValidationError as error:
+        raise _unreadable(path, fault_in(error)) from error
+    except _UNREADABLE as error:
+        raise _unreadable(path, str(error)) from error
     expected = header.pop("tensors_sha256", None)
     if expected is not None and _digest(read_weights(path)) != expected:
         raise CheckpointError(f"{path} is damaged: its tensors are not those that were written. Copy it again")
-    return dict(header)
+    return header
+
+
+def about_in(content: bytes, kind: type[About] = About) -> dict[str, Any]:
+    """Return the JSON object in a manifest or header as it is.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        It is none, is nested too deep, or its values are of other types than those of ``kind``.
+    """
+    kind.model_validate_json(content)
+    return _OBJECT.validate_json(content)
+
+
+_OBJECT: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+_UNREADABLE = (OSError, SafetensorError, RuntimeError, ValueError, OverflowError)
+"""What safetensors and torch make of a file that is missing, cut short or made up."""
+
+
+def _require_short_header(path: Path) -> None:
+    with open_regular(path) as file:
+        length = int.from_bytes(file.read(8), "little")
+    if length > _LONGEST_HEADER:
+        raise ValueError(f"its header would have {length:,} bytes")
+
+
+def _unreadable(path: Path, reason: str) -> CheckpointError:
+    return CheckpointError(f"{path} cannot be read as weights: {reason.splitlines()[0]}. Name a sound checkpoint")
 
 
 def cast_weights(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from torch import nn
 
 from datagen.errors import StorageError
 from tests.support.files import flip_bit, truncate
-from training import checkpoint_folder, weights
+from training import weights
 from training.checkpoint import CheckpointError, export_weights, load_checkpoint, require_checkpoint, save_checkpoint
 from training.random_states import random_states, restore_random_state
 from training.weights import fill_network
@@ -153,13 +153,20 @@ def test_disk_full_keeps_the_last_good_ones(tmp_path: Path, monkeypatch: pytest.
 
 def test_everything_reaches_the_disk_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
-    sync, replace = checkpoint_folder._sync, os.replace
-    monkeypatch.setattr(checkpoint_folder, "_sync", lambda path: (done.append(path.name), sync(path)))
+    sync, replace = os.fsync, os.replace
+
+    def synced(descriptor: int) -> None:
+        done.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(os, "replace", lambda a, b: (done.append(f"-> {Path(b).name}"), replace(a, b)))
     save(tmp_path, 1, best=True, average={"layer.weight": torch.zeros(2, 3)})
-    committed = done.index("-> step-00000001")
-    assert {"weights.safetensors", "average.safetensors", "state.pt", "manifest.json"} < set(done[:committed])
-    assert done[-2:] == ["-> best", "-> latest"]
+    before = done[: done.index("-> step-00000001")]
+    assert {"weights.safetensors", "average.safetensors", "state.pt"} < set(before[: before.index("-> manifest.json")])
+    assert before[-3].startswith(".manifest.json.") and before[-1].startswith(".partial-"), "the manifest, its name"
+    named = [name for name in done if name.startswith("->")]
+    assert named[-2:] == ["-> best", "-> latest"] and done[len(before) + 1] == "checkpoints", "then the folder's name"
 
 
 def test_what_a_kill_left_half_written_is_never_read(tmp_path: Path) -> None:
