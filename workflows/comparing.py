@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 
 from datagen.store import open_dataset
-from training.record import read_record, update_record
+from training.record import has_record, read_record, update_record
 from workflows.cluster import ray_cluster
-from workflows.comparison_evaluation import evaluate_methods, intact, weights_of
+from workflows.comparison_evaluation import FOLDER, evaluate_methods, intact, weights_of
 from workflows.comparison_plan import ComparisonPlan
 from workflows.comparison_report import REPORT, write_comparison_report
 from workflows.pipeline import recorded
@@ -66,11 +66,11 @@ def run_comparison(
         evaluate = Stage(
             "evaluate",
             depends_on=[_learned(plan), weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
-            intact=lambda: intact(out),
+            intact=lambda: intact(out) and has_record(out / FOLDER),
             work=partial(_evaluate, plan, data, runs, out),
         )
         evaluated = run_stage(evaluate, out=out, before=begin)
-        if evaluated or not (out / REPORT).exists():
+        if evaluated or not (out / REPORT).exists() or not has_record(out):
             begin()
             _report(plan, out, runs, command)
     return out / REPORT

@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 from datagen.errors import RecipeError
+from datagen.files import read_text_within
 from training.record import EXPERIMENT
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
@@ -82,7 +83,7 @@ def closing_words(out: Path, tracking: str) -> str:
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
     return "\n".join(
         [
-            (out / "evaluation" / "tables.md").read_text(),
+            read_text_within(out, "evaluation/tables.md"),
             "Where everything lies",
             f"  report        {shown}/report.html, report.md",
             f"  pictures      {shown}/evaluation/figures",

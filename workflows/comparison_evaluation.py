@@ -5,6 +5,10 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
+from datagen.errors import DsffnetError
+from datagen.files import read_text_within
 from datagen.generate import ray_runner
 from datagen.mesh import write_atomically
 from datagen.store import Dataset
@@ -12,18 +16,27 @@ from training.ablation_figure import ablation_figure
 from training.batches import Batch, read_batch
 from training.checkpoint import require_checkpoint
 from training.convergence_figure import convergence_figure
-from training.evaluation import POSE_TYPES, Method, Row, evaluate, evaluation_list, fingerprint_of, write_rows
+from training.evaluation import (
+    POSE_TYPES,
+    Method,
+    Row,
+    evaluate,
+    evaluation_list,
+    fingerprint_of,
+    read_rows,
+    write_rows,
+)
 from training.inference import load_trained
 from training.inference_time import Inference, measure_inference
 from training.recipe import EvaluationRecipe
 from training.record import update_record
+from training.run_files import read_json
 from training.showcase import comparisons_of, draw_comparisons
 from workflows.comparison_plan import ComparisonPlan
 from workflows.comparison_tables import as_markdown, tables_of
 from workflows.pipeline import about_dataset, evaluation_bar, recorded, summary_metrics
 from workflows.progress import sampling
 
-_OUTPUTS = ("rows.csv", "tables.md", "viewer.html", "inference.json")
 FOLDER = "evaluation"
 
 
@@ -33,14 +46,30 @@ def weights_of(runs: Mapping[str, Path]) -> dict[str, str]:
 
 
 def intact(out: Path) -> bool:
-    """Whether the outputs of the evaluation are there."""
-    return all((out / FOLDER / name).is_file() for name in _OUTPUTS)
+    """Whether the outputs of the evaluation are there, and those that are read again can be read."""
+    try:
+        return (
+            (out / FOLDER / "viewer.html").is_file()
+            and bool(read_rows(out / FOLDER / "rows.csv"))
+            and bool(read_inference(out))
+            and bool(read_text_within(out / FOLDER, "tables.md"))
+        )
+    except (OSError, DsffnetError):
+        return False
 
 
 def read_inference(out: Path) -> dict[str, Inference]:
-    """Size and time of each method, as :func:`evaluate_methods` measured them."""
-    found = json.loads((out / FOLDER / "inference.json").read_text())
-    return {name: Inference(**values) for name, values in found.items()}
+    """Size and time of each method, as :func:`evaluate_methods` measured them.
+
+    Raises
+    ------
+    DamagedFileError, UnsafeFileError, OSError
+        There is no such file, or it holds something else.
+    """
+    return read_json(out / FOLDER, "inference.json", _INFERENCE)
+
+
+_INFERENCE = TypeAdapter(dict[str, Inference])
 
 
 def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], out: Path) -> None:

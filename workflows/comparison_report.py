@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from datagen.files import read_text_within
 from datagen.store import Dataset, open_dataset
 from training.cards import dataset_card
 from training.evaluation import NO_OPS, Row, read_rows
@@ -38,7 +39,7 @@ def write_comparison_report(plan: ComparisonPlan, out: Path, runs: Mapping[str, 
         *(_card(name, run, dataset, rows) for name, run in runs.items()),
     ]
     write_report(out, title=plan.title, lead=plain(plan.description), sections=sections)
-    return (out / FOLDER / "tables.md").read_text()
+    return read_text_within(out / FOLDER, "tables.md")
 
 
 def _table(table: NamedTable) -> Block:

@@ -14,6 +14,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from datagen.errors import DsffnetError, RecipeError
+from datagen.files import read_text_within
 from datagen.printable import printable, printable_lines
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
 from training.tracking_store import sqlite_file, sqlite_server
@@ -26,7 +27,9 @@ _OWN = (
     "report.html",
     "report.md",
     "record.json",
+    "record.json.unreadable",
     "mlflow.json",
+    "mlflow.json.unreadable",
     "stages",
     "generate",
     "run",
@@ -36,6 +39,7 @@ _OWN = (
 )
 _OF_A_RUN = (
     "recipe.yaml", "provenance.json", "record.json", "mlflow.json", "metrics.jsonl", "system.jsonl", "latest", "ray",
+    "record.json.unreadable", "mlflow.json.unreadable", "failure.json.unreadable",
     "checkpoints", "figures", "failure.json", "stop", ".launch", "best", "pictures", "input.json", "not-finite.json",
     ".mlflow.lock",
 )  # fmt: skip
@@ -239,7 +243,7 @@ def _programs() -> str:
 def closing_words(out: Path, server: Server) -> str:
     """The table, where everything lies, and what to try next."""
     evaluation = out / "run" / "evaluation"
-    table = (evaluation / "tables.md").read_text()
+    table = read_text_within(evaluation, "tables.md")
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
     run = shlex.quote(str(shown / "run"))
     here = shown / "run" / "evaluation"

@@ -19,10 +19,11 @@ if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its
 from contextlib import ExitStack
 from functools import partial
 
+from datagen.files import read_text_within
 from datagen.store import open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
-from training.record import read_record, update_record
+from training.record import has_record, read_record, update_record
 from training.report import NAMES, report_is_current, workflow_report
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
@@ -81,30 +82,36 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     data, run = str(out / "dataset.zarr"), out / "run"
     sections = recipe.model_dump(mode="json")
     refuse_other_kind(out, "workflow")
+    known = has_record(out)  # the record of the whole is made again with what it shows: the evaluation and the report
     _refuse_conflicts(recipe, data, run)
     with ExitStack() as around:
         begin = once(lambda: _begin(around, recipe, out, tasks))
         generate = Stage(
             "generate",
             depends_on=sections["data"],
-            intact=lambda: is_complete(data),
+            intact=lambda: is_complete(data) and has_record(out / "generate"),
             work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out, tasks=tasks),
         )
         train = Stage(
             "train",
             depends_on=[sections["data"], sections["training"]],
-            intact=lambda: is_trained(recipe.training, data, run),
+            intact=lambda: is_trained(recipe.training, data, run) and has_record(run),
             work=partial(train_stage, recipe.training, data, run, parent=out, tasks=tasks),
         )
         evaluate = Stage(
             "evaluate",
             depends_on=[sections["data"], sections["training"], sections["evaluation"]],
-            intact=lambda: is_evaluated(recipe.evaluation, data, run),
+            intact=lambda: known and is_evaluated(recipe.evaluation, data, run),
             work=partial(_evaluate, recipe, data, run, out, tasks),
         )
         for stage in (generate, train, evaluate):
             run_stage(stage, out=out, before=begin)
-        report = Stage("report", depends_on=sections, intact=lambda: report_is_current(out), work=lambda: _report(out))
+        report = Stage(
+            "report",
+            depends_on=sections,
+            intact=lambda: known and report_is_current(out),
+            work=lambda: _report(out),
+        )
         run_stage(report, out=out, before=lambda: None)
 
 
@@ -139,7 +146,7 @@ def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path, tasks: Ta
         out,
         artifacts=["recipe.yaml", *shown],
         metrics=child.metrics,
-        tags=parent.tags | {"mlflow.note.content": (evaluation / "tables.md").read_text()},
+        tags=parent.tags | {"mlflow.note.content": read_text_within(evaluation, "tables.md")},
     )
 
 

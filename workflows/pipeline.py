@@ -3,13 +3,15 @@
 import json
 import platform
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from datagen.errors import DsffnetError
+from datagen.files import read_text_within
 from datagen.generate import generate
 from datagen.grid import Grid
 from datagen.mesh import bounding_box, write_atomically
@@ -19,7 +21,7 @@ from datagen.store.verify import describe
 from training.checkpoint import CheckpointError, Which, is_finished, load_checkpoint, require_checkpoint
 from training.curves import draw_coefficients
 from training.earlier import recipe_of
-from training.evaluation import NO_OPS, Method, Row, evaluate, method_name, triples_in, write_rows
+from training.evaluation import NO_OPS, Method, Row, evaluate, method_name, read_rows, triples_in, write_rows
 from training.figures import contact_sheet
 from training.inference import load_trained
 from training.launch import launch
@@ -28,6 +30,7 @@ from training.recipe import EvaluationRecipe, TrainingRecipe
 from training.record import MODEL, Record, begin_record, end_record, flatten, read_record, update_record
 from training.report_inline import plain
 from training.report_origin import this_commit, this_machine
+from training.run_files import read_json_if_whole
 from training.showcase import draw_examples, draw_training_curve, examples_of
 from training.tables import COLUMNS, mean_of, methods_of, report
 from training.triples import last_step_of, order_of
@@ -124,8 +127,12 @@ def _train(recipe: TrainingRecipe, dataset: Dataset, run: Path, tasks: TaskRunne
 
 def _say_where_meshes_were(run: Path) -> None:
     """What rank 0 noted; its own log does not reach the driver of a local Ray."""
-    with suppress(OSError, ValueError, KeyError):
-        say(f"train: meshes were kept in {json.loads((run / 'input.json').read_text())['where']}")
+    noted = read_json_if_whole(run, "input.json", _WHERE)
+    if noted:
+        say(f"train: meshes were kept in {noted['where']}")
+
+
+_WHERE: TypeAdapter[dict[Literal["where"], str]] = TypeAdapter(dict[Literal["where"], str])
 
 
 def evaluate_stage(
@@ -212,11 +219,10 @@ def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
 
 def is_evaluated(recipe: EvaluationRecipe, data: str, run: Path) -> bool:
     """Whether the outputs of this evaluation on this dataset are there."""
-    names = ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png")
     record = read_record(run / "evaluation")
     if record is None or record.status != "FINISHED" or record.parameters != flatten(recipe.model_dump(mode="json")):
         return False
-    return _is_of(record, data) and all((run / "evaluation" / name).is_file() for name in names)
+    return _is_of(record, data) and _is_whole(run / "evaluation")
 
 
 def _is_of(record: Record, data: str) -> bool:
@@ -226,6 +232,16 @@ def _is_of(record: Record, data: str) -> bool:
     except DsffnetError:
         return False
     return record.dataset is not None and all(record.dataset.get(key) == there[key] for key in _CONTENT)
+
+
+def _is_whole(evaluation: Path) -> bool:
+    """Whether the outputs of an evaluation are there, and those that are read again can be read."""
+    shown = ("viewer.html", "figures/examples.png", "figures/training-curve.png")
+    try:
+        there = all((evaluation / name).is_file() and (evaluation / name).stat().st_size for name in shown)
+        return there and bool(read_rows(evaluation / "rows.csv")) and bool(read_text_within(evaluation, "tables.md"))
+    except (OSError, DsffnetError):
+        return False
 
 
 def summary_metrics(rows: list[Row]) -> dict[str, float]:

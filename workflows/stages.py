@@ -8,10 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
+
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from datagen.printable import printable
 from training.record import read_record
+from training.run_files import read_json_if_whole
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,13 @@ def say(text: str) -> None:
     print(f"[{time.strftime('%H:%M:%S')}] {printable(text)}", flush=True)
 
 
+class _Mark(TypedDict):
+    fingerprint: str
+
+
+_MARK = TypeAdapter(_Mark)
+
+
 def _done(mark: Path, stage: Stage) -> bool:
-    try:
-        return bool(json.loads(mark.read_text())["fingerprint"] == stage.fingerprint)
-    except (OSError, ValueError, KeyError):
-        return False
+    found = read_json_if_whole(mark.parent, mark.name, _MARK)
+    return found is not None and found["fingerprint"] == stage.fingerprint

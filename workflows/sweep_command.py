@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from datagen.errors import RecipeError
+from datagen.files import read_text_within
 from training.record import EXPERIMENT
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
@@ -79,7 +80,7 @@ def closing_words(results: Sequence[Result], out: Path, tracking: str) -> str:
     """The table, where everything lies, and how to go on with the best trial."""
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
     words = [
-        (out / "sweep.md").read_text(),
+        read_text_within(out, "sweep.md"),
         "Where everything lies",
         f"  table         {shown}/sweep.md, sweep.csv",
         *([f"  figure        {shown}/figures/sweep.png"] if (out / "figures" / "sweep.png").exists() else []),

@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 
 from datagen.errors import RecipeError
+from datagen.files import read_text_within
 from datagen.store import open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.ranks import TrainingStopped
-from training.record import read_record, update_record
+from training.record import has_record, read_record, update_record
 from training.report import report_of_sweep
 from training.sweep_figures import PMD_UNIT
 from training.triples import last_step_of
@@ -68,13 +69,17 @@ def run_sweep(
     data = str(out / "dataset.zarr")
     refuse_conflicts(sweep, data, out, kind="sweep")
     with ExitStack() as around:
+        begin = once(lambda: _begin(around, sweep, out, settings))
         outcomes = generate_and_train(
             sweep,
             out,
-            begin=once(lambda: _begin(around, sweep, out, settings)),
+            begin=begin,
             running=partial(runner, tags=partial(_tags, sweep), cpus=settings.cpus, gpus=settings.gpus),
             told=lambda: _report(sweep, out, settings),
         )
+        if not has_record(out):
+            begin()
+            _report(sweep, out, settings)
         results = results_of(sweep, out) if outcomes else _write_report(sweep, out, settings)
         show(results)
         judge(outcomes, of=len(sweep.trials), strict=settings.strict)
@@ -111,7 +116,7 @@ def generate_and_train(
     generate = Stage(
         "generate",
         depends_on=sweep.recipe.data.model_dump(mode="json"),
-        intact=lambda: is_complete(data),
+        intact=lambda: is_complete(data) and has_record(out / "generate"),
         work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out, tasks=TaskRunner()),
     )
     run_stage(generate, out=out, before=begin)
@@ -147,7 +152,7 @@ def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     record, best = read_record(out), best_of(results)
     assert record is not None
     metrics = {f"trials_{state}": float(sum(r.state == state for r in results)) for state in ("finished", "failed")}
-    tags = record.tags | {"mlflow.note.content": (out / "sweep.md").read_text()}
+    tags = record.tags | {"mlflow.note.content": read_text_within(out, "sweep.md")}
     if best is not None:
         metrics |= {"best_pmd_unseen": best.unseen.final / PMD_UNIT}
         tags |= {"best_trial": best.trial.name}

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from workflows.stages import Stage, run_stage
 
 
@@ -34,8 +36,12 @@ def test_a_stage_that_fails_is_due_again(tmp_path: Path) -> None:
         raise AssertionError("it was skipped although it never finished")
 
 
-def test_a_damaged_mark_means_due(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "mark", [b"", b"{ torn", b"null", b"[1]", b"{}", b'{"fingerprint": 1}', b"\xff", b"[" * 5000 + b"]" * 5000]
+)
+def test_a_damaged_mark_means_due(tmp_path: Path, mark: bytes) -> None:
     stage = Stage("make", 1, intact=lambda: True, work=lambda: None)
     assert run_stage(stage, out=tmp_path, before=lambda: None)
-    (tmp_path / "stages" / "make.json").write_text("{ torn")
+    (tmp_path / "stages" / "make.json").write_bytes(mark)
     assert run_stage(stage, out=tmp_path, before=lambda: None)
+    assert not run_stage(stage, out=tmp_path, before=lambda: None), "it is whole again"
