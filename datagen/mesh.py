@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import MeshError, StorageError
+from datagen.errors import MeshError, storage_errors
 from datagen.files import sync_folder
 from datagen.obj import read_plain
 
@@ -193,7 +193,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     StorageError
         The disk is full, or the place cannot be written to.
     """
-    try:
+    with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.parent / f".{path.name}.{secrets.token_hex(8)}.partial"
         try:
@@ -206,5 +206,3 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
             temporary.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
-    except OSError as error:
-        raise StorageError(f"could not write {path}: {error.strerror or error}") from error

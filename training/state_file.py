@@ -29,7 +29,7 @@ def read_state(folder: Path, name: str) -> dict[str, Any]:
             found = torch.load(file, map_location="cpu", weights_only=True)
     except UnsafeFileError:
         raise
-    except Exception as error:  # a pickle can raise whatever it likes
+    except Exception as error:  # whatever a pickle raises; torch's own words say how to run its code
         raise unusable_state(folder, f"{name} cannot be read: {type(error).__name__}") from error
     if not isinstance(found, dict):
         raise unusable_state(folder, f"{name} holds a {type(found).__name__}")

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from datagen.errors import reason_of
 from datagen.mesh import write_atomically
 from datagen.store import Dataset, open_dataset
 from training.augmentation import Augmentation
@@ -292,7 +293,7 @@ class _Trainer:
             restore_random_state(state["random"], self.ranks.rank)
             self.verdict = Verdict.resumed(state["verdict"], triples=self.recipe.evaluate_triples)
         except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            raise unusable_state(found.path, f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
+            raise unusable_state(found.path, f"{type(error).__name__}: {reason_of(error)}") from error
         self.done, self.finished = found.step, found.finished
 
     def _stopped_early(self) -> None:

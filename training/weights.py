@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from datagen.errors import DsffnetError
+from datagen.errors import DsffnetError, reason_of
 from datagen.files import open_regular
 from training.run_files import fault_in
 
@@ -70,7 +70,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         _require_short_header(path)
         return load_file(path)
     except _UNREADABLE as error:
-        raise _unreadable(path, str(error)) from error
+        raise _unreadable(path, reason_of(error)) from error
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def read_header(path: Path) -> dict[str, Any]:
     except ValidationError as error:
         raise _unreadable(path, fault_in(error)) from error
     except _UNREADABLE as error:
-        raise _unreadable(path, str(error)) from error
+        raise _unreadable(path, reason_of(error)) from error
     expected = header.pop("tensors_sha256", None)
     if expected is not None and _digest(read_weights(path)) != expected:
         raise CheckpointError(f"{path} is damaged: its tensors are not those that were written. Copy it again")
@@ -123,7 +123,7 @@ def _require_short_header(path: Path) -> None:
 
 
 def _unreadable(path: Path, reason: str) -> CheckpointError:
-    return CheckpointError(f"{path} cannot be read as weights: {reason.splitlines()[0]}. Name a sound checkpoint")
+    return CheckpointError(f"{path} cannot be read as weights: {reason}. Name a sound checkpoint")
 
 
 def cast_weights(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
