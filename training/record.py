@@ -65,7 +65,7 @@ class Record:
     status: Status = "RUNNING"
     started: Milliseconds = 0
     ended: Milliseconds | None = None
-    id: str = ""
+    id: Annotated[str, Field(pattern=r"^[0-9A-Za-z-]{0,64}$")] = ""
 
 
 _RECORD: TypeAdapter[Record] = TypeAdapter(Record)

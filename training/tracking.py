@@ -227,7 +227,7 @@ class _Publication:
         from mlflow.entities import Metric
 
         points = [
-            Metric(_key(key), float(value), int(row["time"] * 1000), row["step"])
+            Metric(_key(key), float(value), int(row.get("time", 0) * 1000), row["step"])
             for row in rows
             for key, value in row.items()
             if key not in ("time", "step")
