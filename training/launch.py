@@ -16,10 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 from pydantic import Field, TypeAdapter
 from typing_extensions import TypedDict
-
-import torch
 
 from datagen.errors import DsffnetError
 from datagen.files import read_within
