@@ -1,11 +1,24 @@
 """What every section of a recipe is made of."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, model_validator
 
 Range = tuple[float, float]
+LARGEST = 2**63 - 1
+"""The largest whole number that arrays and stores count with."""
 
 
 class Frozen(BaseModel):
     """Base of every recipe section: immutable, unknown keys are errors, defaults are validated too."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _whole_numbers_can_be_counted_with(self) -> Self:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, int) and abs(number) > LARGEST:
+                    raise ValueError(f"{name} has {number.bit_length():,} bits, the largest whole number has 63")
+        return self

@@ -56,6 +56,8 @@ def learning_of(name: str, run: Path) -> Learning:
     ------
     CheckpointError
         The folder has no journal or no recipe.
+    RecipeError
+        Its recipe cannot be read.
     """
     rows = read_journal(run / "metrics.jsonl")
     if not rows or not (run / "recipe.yaml").is_file():

@@ -4,13 +4,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, ValidationError
 
 from datagen.errors import RecipeError
 from datagen.printable import printable
 from datagen.recipe import Frozen
+from datagen.recipe_text import faults_text, read_values
 from workflows.named_recipes import nearest
 from workflows.recipe import WorkflowRecipe
 from workflows.trials import Sweep, Trial, TrialEntry, resolve
@@ -106,19 +107,9 @@ def _find(name_or_file: str, kind: Kind) -> Path:
 
 
 def _read(path: Path) -> ComparisonFile:
-    import yaml
-
     try:
-        values: Any = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RecipeError(f"{path} cannot be read: {reason}") from error
-    try:
-        return ComparisonFile.model_validate(values)
+        return ComparisonFile.model_validate(read_values(path))
     except ValidationError as error:
-        fault = error.errors()[0]
-        where = ".".join(map(str, fault["loc"])) or "its content"
         raise RecipeError(
-            f"{path} is not a comparison: {where}: {fault['msg']} (given: {fault['input']!r}). "
-            "It has recipe, set, and methods with name and set"
+            f"{path} is not a comparison: {faults_text(error)}. It has recipe, set, and methods with name and set"
         ) from error

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.errors import RecipeError
+from datagen.recipe_text import read_values
 
 _FOLDER = Path(__file__).parent / "recipes"
 
@@ -27,12 +28,10 @@ def named_training(name: str) -> dict[str, Any]:
     RecipeError
         There is none; the nearest and all others are named.
     """
-    from omegaconf import OmegaConf
-
     known = known_trainings()
     if name not in known:
         raise RecipeError(f"no training recipe {name!r}{nearest(name, list(known))}; there are {', '.join(known)}")
-    return dict(OmegaConf.to_container(OmegaConf.load(known[name]))["training"])
+    return dict(read_values(known[name])["training"])
 
 
 def nearest(name: str, known: list[str]) -> str:

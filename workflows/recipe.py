@@ -12,6 +12,7 @@ from datagen.bodies import FAMILIES
 from datagen.errors import RecipeError
 from datagen.poses import SOURCES
 from datagen.recipe import DatasetRecipe, Frozen
+from datagen.recipe_text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
 from training.recipe import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
 from workflows.named_recipes import known_recipes, known_trainings, named_training, nearest
 from workflows.recipe_paths import with_absolute_paths
@@ -67,30 +68,16 @@ def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRec
 
 def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, where: str) -> WorkflowRecipe:
     """A recipe from a file or from values, with overrides; the errors are those of :func:`load_recipe`."""
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
-
     folder = base.resolve().parent if isinstance(base, Path) else Path.cwd()
-    try:
-        read = OmegaConf.to_container(OmegaConf.load(base)) if isinstance(base, Path) else base
-        name, overrides = _named_by(overrides)
-        config = OmegaConf.create(with_absolute_paths(_with_training(read, name), folder))
-        changes = OmegaConf.create(override_values(overrides))
-        for section, kind, default in _KINDS:
-            chosen = OmegaConf.select(changes, f"{section}.{kind}")
-            if chosen is not None and chosen != OmegaConf.select(config, f"{section}.{kind}", default=default):
-                OmegaConf.update(config, section, {}, merge=False)  # the keys of another kind would not fit it
-        for override in overrides:  # one by one, as a key may count the entries of a list
-            key = override.split("=", 1)[0]
-            value = OmegaConf.select(OmegaConf.from_dotlist([override]), key)
-            plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-            last = key.rsplit(".", 1)[-1]
-            OmegaConf.update(config, key, with_absolute_paths({last: plain}, Path.cwd())[last], merge=True)
-        values = OmegaConf.to_container(config, resolve=True)
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AttributeError, IndexError) as error:
-        raise RecipeError(f"recipe {where} cannot be read: {_first_line(error)}") from error
-    return check_recipe(values, where=where)
+    name, words = _named_by(parse_words(overrides, option="--set "))
+    values = read_values(base) if isinstance(base, Path) else base
+    require_plain(values, where=f"recipe {where}")
+    if not isinstance(values, dict):
+        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
+    values = with_absolute_paths(_with_training(values, name), folder)
+    here = Path.cwd()
+    words = [(key, with_absolute_paths({(last := key.rsplit(".", 1)[-1]): value}, here)[last]) for key, value in words]
+    return check_recipe(changed(values, words, kinds=_KINDS), where=where)
 
 
 def override_values(overrides: Sequence[str]) -> dict[str, Any]:
@@ -101,38 +88,21 @@ def override_values(overrides: Sequence[str]) -> dict[str, Any]:
     RecipeError
         A word is not of that form.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
-
-    for override in overrides:
-        if "=" not in override:
-            raise RecipeError(f"--set {override!r} is not of the form section.key=value, e.g. --set training.steps=100")
-    try:
-        return dict(OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides))))
-    except (OmegaConfBaseException, YAMLError, ValueError, TypeError) as error:
-        raise RecipeError(f"--set {' '.join(overrides)} cannot be read: {_first_line(error)}") from error
+    return changed({}, parse_words(overrides, option="--set "))
 
 
-def _named_by(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
+def _named_by(words: Words) -> tuple[str | None, Words]:
     """The training recipe that ``training=NAME`` asks for, if any, and the other overrides, which refine it."""
-    import yaml
-
-    name, others = None, []
-    for word in overrides:
-        value = yaml.safe_load(word.removeprefix("training=")) if word.startswith("training=") else None
-        if isinstance(value, str):
-            name = value
-        else:
-            others.append(word)
-    return name, others
+    names = [value for key, value in words if key == "training" and isinstance(value, str)]
+    others = [(key, value) for key, value in words if not (key == "training" and isinstance(value, str))]
+    return (names[-1] if names else None), others
 
 
-def _with_training(values: Any, name: str | None) -> Any:
+def _with_training(values: dict[str, Any], name: str | None) -> dict[str, Any]:
     """The same with a training recipe in the place of its name, or the one named here in the place of any."""
-    if name is None and isinstance(values, dict) and isinstance(values.get("training"), str):
+    if name is None and isinstance(values.get("training"), str):
         name = values["training"]
-    return values if name is None else {**(values or {}), "training": named_training(name)}
+    return values if name is None else {**values, "training": named_training(name)}
 
 
 def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
@@ -144,7 +114,7 @@ def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
         With one line a fault: which key, what is wrong, what was given.
     """
     if not isinstance(values, dict) or not values:
-        raise RecipeError(f"recipe {where} is not a mapping of sections (data, training, evaluation), or is empty")
+        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
     with recipe_faults(where):
         return WorkflowRecipe.model_validate(values)
 
@@ -155,7 +125,7 @@ def recipe_faults(where: str) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        faults = "; ".join(_describe(fault) for fault in error.errors())
+        faults = faults_text(error, _describe)
         raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help") from error
 
 
@@ -228,15 +198,8 @@ def _describe(fault: Any) -> str:
         known = [line.split()[0] for line in describe_fields()]
         if key in known:
             return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
-        return f"unknown key {key!r}{nearest(key, known)}"
-    message = fault["msg"].removeprefix("Value error, ")
-    # of a whole section that does not fit together, the message names the keys
-    given = "" if isinstance(fault["input"], dict) else f" (given: {fault['input']!r})"
-    return f"{key}: {message}{given}" if key else f"{message}{given}"
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        return f"unknown key {shown(key)}{nearest(key, known)}"
+    return fault_text(fault, key=key)
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
@@ -248,5 +211,6 @@ def _parts(annotation: Any) -> Iterator[Any]:
             yield from _parts(member)
 
 
+_NO_SECTIONS = "is not a mapping of sections (data, training, evaluation), or is empty"
 _UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
 _MEMBERS = {*FAMILIES, *SOURCES, *NETWORK_NAMES}

@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from datagen.recipe import Frozen
+from datagen.recipe_text import faults_text, read_values
 from training.recipe import TrainingRecipe
 from training.record import flatten
 from workflows.grids import in_a_name, parse_grid, short_names
@@ -134,8 +135,6 @@ def read_sweep(name_or_file: str) -> SweepFile:
     RecipeError
         No such sweep, not YAML, or not a list of trials.
     """
-    import yaml
-
     path = known_sweeps().get(name_or_file, Path(name_or_file))
     if path.suffix not in (".yaml", ".yml"):
         nearest = difflib.get_close_matches(name_or_file, known_sweeps(), n=1, cutoff=0.4)
@@ -143,15 +142,11 @@ def read_sweep(name_or_file: str) -> SweepFile:
         raise RecipeError(
             f"no sweep {name_or_file!r}{hint}; there are {', '.join(known_sweeps())}, or give a YAML file"
         )
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RecipeError(f"sweep {path} cannot be read: {reason}") from error
+    values = read_values(path)
     try:
         return SweepFile.model_validate({"trials": values} if isinstance(values, list) else values)
     except ValidationError as error:
-        raise RecipeError(f"{path} is not a list of trials: {_faults(error)}. {_FORM}") from error
+        raise RecipeError(f"{path} is not a list of trials: {faults_text(error)}. {_FORM}") from error
 
 
 def write_sweep(sweep: Sweep, path: Path) -> None:
@@ -218,10 +213,3 @@ def _trial(entry: TrialEntry, recipe: str, words: tuple[str, ...]) -> Trial:
         return Trial(entry.name, entry.description, entry.set, load_recipe(recipe, [*words, *entry.set]))
     except RecipeError as error:
         raise RecipeError(f"trial {entry.name}: {error}") from error
-
-
-def _faults(error: ValidationError) -> str:
-    return "; ".join(
-        f"{'.'.join(map(str, fault['loc'])) or 'its content'}: {fault['msg']} (given: {fault['input']!r})"
-        for fault in error.errors()[:3]
-    )

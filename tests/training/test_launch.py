@@ -118,10 +118,10 @@ def test_a_section_or_a_whole_recipe_with_words(tmp_path: Path, whole: bool, suf
     [
         ("batch: 0\nstepz: 3", [], r"batch: .* \(given: 0\); stepz: Extra inputs.* \(given: 3\)"),
         ("batch: 4", ["ranks=3"], "batch 4 cannot be shared equally by 3 ranks"),
-        ("batch: 4", ["ranks"], "'ranks' is not of the form key=value"),
+        ("batch: 4", ["ranks"], "'ranks' is not of the form section.key=value"),
         ("training: npt-paper", [], "names the training recipe 'npt-paper'"),
         ("- 1", [], "it holds list, not keys"),
-        ("a: [", [], "cannot be read as a training recipe"),
+        ("a: [", [], "cannot be read: .*line 2"),
     ],
 )
 def test_a_recipe_that_cannot_be_is_one_line_with_every_fault(

@@ -171,7 +171,7 @@ def test_a_grid_that_cannot_be_is_one_clear_error(vary: list[str], says: str, ti
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("just words", "is not a list of trials: its content: .*A trial is {name: "),
+        ("just words", "is not a list of trials: .*just words.*A trial is {name: "),
         ("trials: {a: 1}", "is not a list of trials: trials: "),
         ("[{name: a, sett: []}]", r"trials.0.sett: Extra inputs"),
         ("[{name: a, set: training.seed=1}]", r"trials.0.set: .*given: 'training.seed=1'"),
