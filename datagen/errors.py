@@ -48,6 +48,10 @@ class DamagedFileError(DsffnetError):
     """A file that does not hold what is written to such a file (empty, cut short, garbage, of other types)."""
 
 
+class OutOfMemory(DsffnetError):
+    """Memory ran out, of the machine or of a GPU; what was complete is untouched."""
+
+
 def reason_of(error: BaseException) -> str:
     """Return what an exception says in one short line: the operating system's words, or its own."""
     words = str(getattr(error, "strerror", None) or error)

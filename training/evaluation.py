@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import DsffnetError
+from datagen.errors import DsffnetError, RecipeError
 from datagen.grid import PoseType
+from datagen.resources import bytes_text, free_memory
 from datagen.store import Dataset, open_dataset
 from training import paper
 from training.checkpoint import Checkpoint, require_checkpoint
@@ -47,6 +48,8 @@ Runner = Callable[[Callable[..., Any], list[tuple[Any, ...]]], Iterator[Any]]
 Progress = Callable[[Iterable[list[Row]], int, int], Iterable[list[Row]]]
 """Passes on rows as they come; told the triples of the whole evaluation, and those that were kept from before."""
 
+_DISTANCE = 2 * 8
+"""Bytes of a pair of points in the earth mover's distance: its cost in float64, and that reduced."""
 _MEASURED_AS = 1
 """Raise this when a metric is computed otherwise, so that rows kept by an earlier version are not taken for new."""
 
@@ -99,8 +102,11 @@ def evaluate(
         Two methods of one name, no triples, or a network that cannot take the vertex counts.
     CheckpointError
         Weights are missing or damaged.
+    RecipeError
+        The earth mover's distance of so many points needs more memory than there is.
     """
     dataset = open_dataset(data)
+    _require_memory(dataset, recipe)
     pieces = _pieces(dataset, _contenders(methods, dataset, recipe), recipe)
     found = {piece: kept for piece in pieces if keep and (kept := read_piece(keep / piece.file, piece.expected))}
     missing = _by_chunk(piece for piece in pieces if piece not in found)
@@ -115,6 +121,17 @@ def evaluate(
     if keep:
         forget_pieces(keep, but=[piece.file for piece in pieces])
     return sorted(row for rows in found.values() for row in rows)
+
+
+def _require_memory(dataset: Dataset, recipe: EvaluationRecipe) -> None:
+    counts = (dataset.vertex_count(identity) for identity in dataset.identities("evaluation"))
+    points = min(recipe.emd_points, max(counts, default=0))
+    needed, free = _DISTANCE * points**2, free_memory()
+    if needed > free:
+        raise RecipeError(
+            f"the earth mover's distance of {points:,} points takes {bytes_text(needed)} of memory, but "
+            f"{bytes_text(free)} are free. Lower evaluation.emd_points (it is {recipe.emd_points:,})"
+        )
 
 
 def triples_in(rows: Iterable[Row]) -> int:

@@ -84,7 +84,7 @@ def _row(nvml: Any, handle: Any) -> tuple[float | None, ...]:
 
 def _from_nvidia_smi() -> dict[str, float]:
     try:
-        done = subprocess.run(_QUERY, capture_output=True, text=True, timeout=5, check=True)
+        done = subprocess.run(_QUERY, capture_output=True, encoding="utf-8", errors="replace", timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):
         return {}
     rows = [[_number(value) for value in line.split(",")] for line in done.stdout.splitlines() if line.count(",") == 2]

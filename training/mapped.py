@@ -22,8 +22,8 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from datagen.errors import storage_errors
+from datagen.resources import bytes_text
 from training.layout import Floats, Layout, decode
-from training.room import gigabytes
 
 FORMAT = 1
 """Of the file (with its chunks, :meth:`Layout.chunks`) and of how vertices are normalised: another is another file."""
@@ -133,7 +133,7 @@ def _telling(sizes: list[int], path: Path, log: Log) -> Iterator[int]:
     began, told = time.monotonic(), False
     for size in sizes:
         if not told and time.monotonic() - began > _PATIENCE:
-            log(f"checking {path} ({gigabytes(sum(sizes))}) against its checksums before it is used")
+            log(f"checking {path} ({bytes_text(sum(sizes))}) against its checksums before it is used")
             told = True
         yield size
 
@@ -192,7 +192,7 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def _writing(path: Path, *, needed: int = 0) -> AbstractContextManager[None]:
-    size = f" ({gigabytes(needed)})" if needed else ""
+    size = f" ({bytes_text(needed)})" if needed else ""
     return storage_errors(
         f"the cache {path}{size}",
         advice="Free some room (old .vertices files there may go), choose another folder: --set "

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from datagen.grid import PoseType
 from datagen.mesh import bounding_box, edges_of
+from datagen.resources import memory_errors
 from datagen.store import Dataset, open_dataset
 from training import metrics
 from training.batches import Batch, read_batch
@@ -70,7 +71,14 @@ def measure_chunk(
     contenders: Sequence[Contender], data: str, recipe: EvaluationRecipe, pose_type: PoseType, start: int
 ) -> list[Row]:
     """Rows of the triples [start, start + recipe.chunk) of one list, for each contender."""
-    dataset = open_dataset(data)
+    advice = f"Lower evaluation.chunk (it is {recipe.chunk}) or evaluation.emd_points (it is {recipe.emd_points})"
+    with memory_errors(advice):
+        return _measured(contenders, open_dataset(data), recipe, pose_type, start)
+
+
+def _measured(
+    contenders: Sequence[Contender], dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType, start: int
+) -> list[Row]:
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
     batch, groups = read_batch(dataset, triples, padded=True), _groups(dataset, triples)
     return [

@@ -178,7 +178,9 @@ class TrainingRecipe(Frozen):
     picture_every: int | None = Field(None, ge=1, description="steps between pictures of a few fixed transfers")
     checkpoint_every: int = Field(500, ge=1, description="steps between checkpoints")
     keep_checkpoints: int = Field(2, ge=1, description="newest checkpoints that are kept, beside the best")
-    timeout: int = Field(300, ge=10, description="seconds after which a rank gives up waiting for the others")
+    timeout: int = Field(
+        300, ge=10, le=604_800, description="seconds after which a rank gives up waiting for the others"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingRecipe":

@@ -1,17 +1,16 @@
 """Where decoded meshes are kept: the fastest place that has room for them, said in words."""
 
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import psutil
 import torch
 
 from datagen.errors import RecipeError
+from datagen.resources import bytes_text, free_disk, free_memory
 
 Cache = Literal["auto", "device", "memory", "mapped", "stream"]
 Place = Literal["device", "memory", "mapped", "stream"]
@@ -19,7 +18,6 @@ Place = Literal["device", "memory", "mapped", "stream"]
 _DEVICE_SHARE = 0.4  # the rest is for weights and activations, which at 6,890 vertices take far more than meshes
 _MEMORY_SHARE = 0.5
 _DISK_SHARE = 0.8
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -43,14 +41,6 @@ class Choice:
     why: str
 
 
-def gigabytes(size: float) -> str:
-    """Bytes as a person reads them."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6)):
-        if size >= factor:
-            return f"{size / factor:,.1f} {unit}"
-    return f"{size / 1e3:,.1f} kB"
-
-
 def device_room(device: torch.device) -> Room:
     """Free memory of a GPU."""
     return Room("device memory", int(torch.cuda.mem_get_info(device)[0]), _DEVICE_SHARE)
@@ -58,25 +48,12 @@ def device_room(device: torch.device) -> Room:
 
 def memory_room() -> Room:
     """Free memory of this machine, or of the container that it runs in."""
-    return Room("memory", min(int(psutil.virtual_memory().available), _container_room()), _MEMORY_SHARE)
-
-
-def _container_room(cgroup: Path = _CGROUP) -> int:
-    """Bytes left within a container's limit (Linux, cgroup v2); files that it has read can be dropped, so are free."""
-    try:
-        limit, used = (int((cgroup / name).read_text()) for name in ("memory.max", "memory.current"))
-        lines = (line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
-        droppable = sum(int(value) for name, value in lines if name in ("active_file", "inactive_file"))
-    except (OSError, ValueError):  # no such file, or the limit is: max
-        return 2**63
-    return max(0, limit - used + droppable)
+    return Room("memory", free_memory(), _MEMORY_SHARE)
 
 
 def disk_room(folder: Path) -> Room:
     """Free space of the disk on which a folder lies or will lie."""
-    whole = folder.absolute()
-    there = next(place for place in (whole, *whole.parents) if os.path.exists(place))  # Path's raises if not permitted
-    return Room(f"disk of {folder}", shutil.disk_usage(there).free, _DISK_SHARE)
+    return Room(f"disk of {folder}", free_disk(folder), _DISK_SHARE)
 
 
 def default_folder() -> Path:
@@ -118,16 +95,16 @@ def choose(cache: Cache, size: int, *, device: torch.device, mapped: Callable[[]
             needed, room = look()
             if room.holds(needed) or (cache == place and needed <= room.free):
                 return Choice(place, _why(place, size, needed, room))
-            tried.append(f"{gigabytes(needed)} are too much for the {room.where} ({gigabytes(room.free)} free)")
+            tried.append(f"{bytes_text(needed)} are too much for the {room.where} ({bytes_text(room.free)} free)")
     if cache not in ("auto", "stream"):
         raise RecipeError(f"training.cache is {cache!r}, but {tried[0]}. Use --set training.cache=auto")
-    return Choice("stream", f"streamed, {gigabytes(size)} in all: {'; '.join(tried) or 'as the recipe says'}")
+    return Choice("stream", f"streamed, {bytes_text(size)} in all: {'; '.join(tried) or 'as the recipe says'}")
 
 
 def _why(place: Place, size: int, needed: int, room: Room) -> str:
-    copies = f" ({needed // size} processes: {gigabytes(needed)})" if needed > size else ""
+    copies = f" ({needed // size} processes: {bytes_text(needed)})" if needed > size else ""
     if place == "mapped":
-        return f"memory-mapped file: {gigabytes(size)}" + (
-            f", {gigabytes(room.free)} free on the {room.where}" if needed else " that is there already"
+        return f"memory-mapped file: {bytes_text(size)}" + (
+            f", {bytes_text(room.free)} free on the {room.where}" if needed else " that is there already"
         )
-    return f"{room.where}: {gigabytes(size)} of {gigabytes(room.free)} free{copies}"
+    return f"{room.where}: {bytes_text(size)} of {bytes_text(room.free)} free{copies}"

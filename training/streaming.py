@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.errors import RecipeError
+from datagen.resources import bytes_text
 from training.layout import Floats, Layout
-from training.room import gigabytes
 
 _READERS_HERE, _READERS_AFAR = 2, 16  # a remote store answers in some 30 ms, whatever is asked
 _REQUEST_BYTES_HERE, _REQUEST_BYTES_AFAR = 2**18, 2**21  # that are read and decoded in the time of one more request
@@ -61,7 +61,7 @@ class StreamedMeshes:
         if len(wanted) > self.slots:
             raise RecipeError(
                 f"a batch needs {len(wanted)} meshes at once, but streaming has memory for {self.slots} "
-                f"({gigabytes(12 * self.rows * self.slots)}). Lower training.batch or use --set training.cache=mapped"
+                f"({bytes_text(12 * self.rows * self.slots)}). Lower training.batch or use --set training.cache=mapped"
             )
         with self._guard:
             missing = np.array([mesh for mesh in wanted.tolist() if mesh not in self._slot], np.int64)

@@ -18,6 +18,7 @@ import torch.distributed as dist
 
 from datagen.errors import reason_of
 from datagen.mesh import write_atomically
+from datagen.resources import memory_errors
 from datagen.store import Dataset, open_dataset
 from training.augmentation import Augmentation
 from training.banks import Bank, open_bank
@@ -50,6 +51,7 @@ from training.recipe import TrainingRecipe, budget_seconds
 from training.resume import checkpoint_to_go_on_from, weights_to_begin_from
 from training.snapshots import snapshot_path
 from training.state_file import unusable_state
+from training.step_memory import require_step_memory
 from training.triples import last_step_of, order_of
 
 log = logging.getLogger(__name__)
@@ -57,6 +59,12 @@ _CHECK_EVERY = {"cpu": 1, "cuda": 16}
 """Steps between looks at whether all is finite and nobody asked to stop. On a GPU each look waits for its queue."""
 _SAY_EVERY = 20.0
 """Seconds between lines of the log."""
+
+
+_LESS_MEMORY = (
+    "The last checkpoint is kept. Lower training.batch (it is {0.batch}), raise training.accumulate (it is "
+    "{0.accumulate}), or lower the network's widths or the vertices"
+)
 
 
 def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None = None) -> int:
@@ -84,14 +92,16 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
         After SIGTERM: the step was finished and a checkpoint written.
     BudgetSpent
         The recipe's time budget for one command is used up; a checkpoint was written.
-    TrainingError, DatasetError, CheckpointError, StorageError
+    TrainingError, DatasetError, CheckpointError, StorageError, OutOfMemory
         See their messages; the last good checkpoint is kept.
+    RecipeError
+        A step needs more memory than there is.
     """
     now = time.time()
     ranks = Ranks.from_environment()
     device = device_of(recipe, ranks)
     launched = dist.is_initialized()  # by Ray Train, whose driver keeps RUN/stop
-    with process_group(ranks, recipe), alone_in(run, ranks):
+    with memory_errors(_LESS_MEMORY.format(recipe)), process_group(ranks, recipe), alone_in(run, ranks):
         if not launched:
             forget_old_stop(run, ranks, before=now)
         with StopRequest(run) as stop:
@@ -100,6 +110,7 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
             if found and is_finished(found, last_step_of(recipe, dataset)):
                 return found.step
             require_measurable(dataset, recipe)
+            agreed(ranks, lambda: require_step_memory(recipe, dataset, device, ranks), what="hold a step in memory")
             # The trainer must be gone before its process group is: see tests/training/one_rank.py.
             return _Trainer(recipe, dataset, run, ranks, device, stop, began or now, found).run()
 

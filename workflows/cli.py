@@ -30,8 +30,12 @@ _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script."""
     words = with_axes_joined(sys.argv[1:] if arguments is None else arguments)
+    guarded(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> None:
     options = _parser(words).parse_args(words)
-    guarded(lambda: options.command(options))
+    options.command(options)
 
 
 def with_axes_joined(words: Sequence[str]) -> list[str]:

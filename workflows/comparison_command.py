@@ -13,7 +13,8 @@ from workflows.cluster import require_reachable
 from workflows.commands import print_text
 from workflows.comparing import OWN, Settings, run_comparison
 from workflows.comparison_plan import Kind, known_comparisons, plan_comparison
-from workflows.console import add_set_option, add_tracking_option, alone_in, server_of
+from workflows.console import add_set_option, add_tracking_option, add_yes_option, alone_in, server_of
+from workflows.data_size import announce_size
 from workflows.sweeping import remove_sweep
 
 _SCRIPTS: dict[Kind, str] = {"comparison": "compare", "ablation": "ablation"}
@@ -33,6 +34,7 @@ def add_comparison_options(made: argparse.ArgumentParser, kind: Kind) -> None:
     )  # fmt: skip
     add_tracking_option(made)
     add("--fresh", action="store_true", help="remove what DIR holds of this and start over")
+    add_yes_option(made)
 
 
 def compare_command(options: argparse.Namespace) -> None:
@@ -53,6 +55,7 @@ def _run(options: argparse.Namespace, kind: Kind) -> None:
             "needs one CPU or more, and no less than no GPU"
         )
     out = Path(require_reachable(options.out or f"runs/{_SCRIPTS[kind]}-{comparison.name}", option="--out"))
+    announce_size(comparison.recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
     server = server_of(out, options.tracking_uri)
     mirror = Mirror(out, server)
     with alone_in(out):

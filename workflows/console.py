@@ -1,21 +1,24 @@
 """How the commands speak: options, errors in one line with an exit status, and the closing words."""
 
 import argparse
+import io
 import logging
 import os
 import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from filelock import FileLock, Timeout
 
-from datagen.errors import DsffnetError, RecipeError
+from datagen.errors import DsffnetError, RecipeError, reason_of
 from datagen.files import read_text_within
 from datagen.printable import printable, printable_lines
+from datagen.resources import ran_out_of_memory
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
 from training.tracking_store import sqlite_file, sqlite_server
 from workflows.cluster import require_reachable
@@ -44,6 +47,8 @@ _OF_A_RUN = (
     ".mlflow.lock",
 )  # fmt: skip
 
+_LESS = "lower counts, vertices, training.batch or widths"
+
 
 class WorkflowError(DsffnetError):
     """A workflow that cannot run as asked."""
@@ -52,29 +57,68 @@ class WorkflowError(DsffnetError):
 def guarded(main: Callable[[], None]) -> None:
     """Run a command; what a person can mend becomes one line on standard error and an exit status.
 
+    What the terminal's encoding lacks is written with escapes.
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop,
     129: the terminal was closed.
     """
-    logging.basicConfig(level=logging.WARNING)
-    for handler in logging.getLogger().handlers:
-        handler.setFormatter(_Printable("%(levelname)s: %(message)s"))
-    told: list[int] = []
-    signal.signal(signal.SIGTERM, lambda number, _: _interrupt(told, number))
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
-        signal.signal(signal.SIGHUP, lambda number, _: _interrupt(told, number))
+    _prepare_output()
+    told = _heed_signals()
     try:
+        _require_text(sys.argv[1:])
         main()
     except DsffnetError as error:
-        print(f"error: {printable(error)}", file=sys.stderr)
-        sys.exit(error.exit_status)
+        _fail(str(error), error.exit_status)
     except KeyboardInterrupt as interrupt:
         what_next = str(interrupt) or "run the same command again to go on from here"
         print(f"{'stopped' if told else 'interrupted'}; {what_next}", file=sys.stderr)
         sys.exit(128 + (told[0] if told else signal.SIGINT))
+    except UnicodeEncodeError as error:
+        log.debug("as raised", exc_info=True)
+        _fail(f"{error.object[:300]!r} is not UTF-8 text, which a name must be here. Rename it")
     except OSError as error:
         log.debug("as raised", exc_info=True)
-        print(f"error: {printable(error)}. Nothing that was complete is lost; mend this and run again", file=sys.stderr)
-        sys.exit(1)
+        _fail(f"{error}. Nothing that was complete is lost; mend this and run again")
+    except Exception as error:
+        if not ran_out_of_memory(error):
+            raise
+        log.debug("as raised", exc_info=True)
+        _fail(f"memory ran out ({reason_of(error)}). Nothing that was complete is lost; {_LESS}, and run again")
+
+
+def _prepare_output() -> None:
+    """Let messages hold nothing that a terminal obeys, and print what its encoding lacks as escapes."""
+    logging.basicConfig(level=logging.WARNING)
+    for handler in logging.getLogger().handlers:
+        handler.setFormatter(_Printable("%(levelname)s: %(message)s"))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _heed_signals() -> list[int]:
+    """End at SIGTERM and SIGHUP as at Ctrl-C; return the list that the number of such a signal comes into."""
+    told: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: _interrupt(told, number))
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, lambda number, _: _interrupt(told, number))
+    return told
+
+
+def _require_text(words: Sequence[str]) -> None:
+    """Refuse names that a shell whose encoding is not UTF-8 cannot say: Ray, MLflow and records would write others."""
+    encoding = sys.getfilesystemencoding()
+    unreadable = [word for word in (*words, os.getcwd()) if any("\udc80" <= letter <= "\udcff" for letter in word)]
+    if unreadable and encoding != "utf-8":
+        name = os.fsencode(unreadable[0]).decode(errors="replace")
+        raise RecipeError(
+            f"{name!r} cannot be read in this shell's encoding, {encoding}. Set PYTHONUTF8=1 and run again"
+        )
+
+
+def _fail(message: str, status: int = 1) -> NoReturn:
+    """End with one line on standard error; what no terminal should be sent is escaped."""
+    print(f"error: {printable(message)}", file=sys.stderr)
+    sys.exit(status)
 
 
 class _Printable(logging.Formatter):
@@ -97,6 +141,7 @@ def workflow_parser(text: str) -> argparse.ArgumentParser:
     made.add_argument("--out", metavar="DIR", help="folder for dataset, run and MLflow store (default runs/RECIPE)")
     add_tracking_option(made)
     made.add_argument("--fresh", action="store_true", help="remove what DIR holds of this workflow and start over")
+    add_yes_option(made)
     return made
 
 
@@ -139,6 +184,11 @@ def add_set_option(made: argparse.ArgumentParser) -> None:
 def add_local_option(made: argparse.ArgumentParser) -> None:
     """--local."""
     made.add_argument("--local", action="store_true", help="all in this process, without Ray, however much it is")
+
+
+def add_yes_option(made: argparse.ArgumentParser) -> None:
+    """--yes."""
+    made.add_argument("--yes", action="store_true", help="make the dataset though its disk looks too small for it")
 
 
 def add_tracking_option(made: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from datagen.exporters import ExportLayout
 from datagen.layouts import Layout
 from datagen.recipe import AnnyTopology
 from datagen.standins import Kind
-from workflows.console import add_local_option, add_recipe_options, add_set_option
+from workflows.console import add_local_option, add_recipe_options, add_set_option, add_yes_option
 
 
 def declare_generate(made: argparse.ArgumentParser) -> None:
@@ -26,6 +26,7 @@ def declare_append(made: argparse.ArgumentParser) -> None:
     ):
         made.add_argument(f"--{name}", type=int, metavar="TOTAL", help=f"{what}, with those that are there")
     add_local_option(made)
+    add_yes_option(made)
     add_set_option(made)
 
 
@@ -77,3 +78,4 @@ def declare_stand_in(made: argparse.ArgumentParser) -> None:
 def _add_making(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="X.zarr", help="where the dataset goes (folder or store URL)")
     add_local_option(parser)
+    add_yes_option(parser)

@@ -28,20 +28,21 @@ def generate_command(options: argparse.Namespace) -> None:
     from datagen.generate import generate
 
     recipe = load_recipe(options.recipe, options.set).data
-    with _runner(options) as how:
+    with _runner(options, recipe, anew=options.fresh) as how:
         generate(recipe, options.out, fresh=options.fresh, **how)
     _show(options.out)
 
 
 def append_command(options: argparse.Namespace) -> None:
     """Give a dataset more identities or poses, up to these totals; nothing that is there is touched."""
-    from datagen.generate import append
+    from datagen.generate import append, grown_recipe
 
     totals = {name: getattr(options, name) for name in ("training", "evaluation", "seen", "unseen")}
     if not any(total is not None for total in totals.values()):
         raise RecipeError("nothing to append: name at least one of --training, --evaluation, --seen, --unseen")
     recipe = _own_recipe(options.out, options.set)
-    with _runner(options) as how:
+    grown = grown_recipe(options.out, recipe, totals)
+    with _runner(options, grown, anew=grown != recipe) as how:
         append(options.out, **totals, recipe=recipe, **how)
     _show(options.out)
 
@@ -68,7 +69,7 @@ def verify_command(options: argparse.Namespace) -> None:
     from workflows.progress import bar
 
     recipe = _own_recipe(options.dataset, options.set)
-    count = len(Grid(recipe).shards())
+    count = Grid(recipe).shard_count
     faults = list(
         find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
     )
@@ -112,7 +113,7 @@ def import_command(options: argparse.Namespace) -> None:
         found = found_recipe(options.layout, options.folder, **of_body)
     base = {"data": found.model_dump(mode="json")}
     recipe = change_recipe(base, options.set, where=f"import {options.layout}").data
-    with _runner(options) as how:
+    with _runner(options, recipe, anew=options.fresh) as how:
         generate(recipe, options.out, fresh=options.fresh, **how)
     _show(options.out)
 
@@ -167,13 +168,15 @@ def stand_in_command(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _runner(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Where tasks run and what shows their progress."""
+def _runner(options: argparse.Namespace, recipe: DatasetRecipe, *, anew: bool) -> Iterator[dict[str, Any]]:
+    """Where tasks run (here or on Ray, by their size) and what shows their progress, once there is room for all."""
     from workflows.cluster import require_reachable
+    from workflows.data_size import announce_size
     from workflows.pipeline import generation_bar
     from workflows.tasks import TaskRunner
 
     options.out = require_reachable(options.out, option="--out", urls=True)
+    announce_size(recipe, options.out, anew=anew, yes=options.yes, local=options.local)
     with TaskRunner(local=options.local) as tasks:
         yield {"run": tasks.make_shards, "progress": generation_bar}
 

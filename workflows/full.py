@@ -37,6 +37,7 @@ from workflows.console import (
     start_over,
     workflow_parser,
 )
+from workflows.data_size import announce_size
 from workflows.pipeline import (
     check_run_accepts,
     evaluate_stage,
@@ -60,6 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
     recipe = load_recipe(options.recipe, options.set)
     name = Path(options.recipe).stem
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
+    announce_size(recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
     server = server_of(out, options.tracking_uri)
     mirror = Mirror(out, server)
     with alone_in(out):

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
 from datagen.recipe import AnnyTopology, DatasetRecipe
+from datagen.recipe_base import LARGEST
 from training.generalisation import (
     GeneralisationRow,
     Kind,
@@ -112,6 +113,8 @@ def _sizes(options: argparse.Namespace) -> Sizes:
             f"--identities {options.identities} --poses {options.poses} --triples {options.triples} "
             f"--seed {options.seed}: a transfer needs two identities and two poses; use 2, 2, 1, 0 or more"
         )
+    if max(options.identities, options.poses, options.triples, options.seed) > LARGEST:
+        raise RecipeError("--identities, --poses, --triples and --seed have 18 digits at most")
     return Sizes(options.identities, options.poses, options.triples, options.seed)
 
 

@@ -12,7 +12,8 @@ from training.record import EXPERIMENT
 from training.tracking import Mirror
 from workflows.cluster import require_reachable
 from workflows.commands import print_text
-from workflows.console import add_recipe_options, add_tracking_option, alone_in, server_of
+from workflows.console import add_recipe_options, add_tracking_option, add_yes_option, alone_in, server_of
+from workflows.data_size import announce_size
 from workflows.sweep_report import Result, best_of, parse_levels
 from workflows.sweeping import Settings, remove_sweep, run_sweep
 from workflows.trials import known_sweeps, plan_sweep
@@ -43,6 +44,7 @@ def add_sweep_options(made: argparse.ArgumentParser) -> None:
     add("--strict", action="store_true", help="exit status 1 if any trial failed, not only if all did")
     add_tracking_option(made)
     add("--fresh", action="store_true", help="remove what DIR holds of this sweep and start over")
+    add_yes_option(made)
 
 
 def sweep_command(options: argparse.Namespace) -> None:
@@ -58,6 +60,7 @@ def sweep_command(options: argparse.Namespace) -> None:
         name, parse_levels(options.reach), options.cpus_per_trial, options.gpus_per_trial, options.strict
     )
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
+    announce_size(sweep.recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
     server = server_of(out, options.tracking_uri)
     mirror = Mirror(out, server)
 

@@ -2,6 +2,7 @@
 
 import difflib
 import itertools
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -22,6 +23,7 @@ from workflows.grids import in_a_name, parse_grid, short_names
 from workflows.recipe import WorkflowRecipe, load_recipe
 
 _FOLDER = Path(__file__).parent / "sweeps"
+_MOST_TRIALS = 10_000
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=+-]{0,99}")
 
 
@@ -178,6 +180,9 @@ def _combined(trials: Sequence[TrialEntry], grid: dict[str, tuple[str, ...]]) ->
     names = short_names(list(grid))
     if not (trials or grid):
         return
+    count = max(1, len(trials)) * math.prod(map(len, grid.values()))
+    if count > _MOST_TRIALS:
+        raise RecipeError(f"the varied values make {count:,} trials, more than {_MOST_TRIALS:,}. Vary fewer at a time")
     for entry in trials or (None,):
         for values in itertools.product(*grid.values()):
             own = [f"{short}={in_a_name(value)}" for short, value in zip(names, values, strict=True)]

@@ -18,6 +18,7 @@ class Family(NamedTuple):
     name: str
     body: BodyModel
     poses: PoseRecipe
+    expected_vertices: float | None
 
     def identity(self, number: int) -> np.ndarray:
         return self.body.draw_identity(generator(0, Stream.IDENTITY, number), number)
@@ -35,7 +36,7 @@ def family(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     parts = recipe_parts(request.param, tmp_path_factory.mktemp(request.param))
     poses = {"seen": 4, "unseen": 2, "distribution": parts["distribution"]}
     recipe = DatasetRecipe.model_validate({"body": parts["body"], "poses": poses})
-    return Family(request.param, load_body(recipe.body), recipe.poses)
+    return Family(request.param, load_body(recipe.body), recipe.poses, recipe.body.expected_vertices)
 
 
 def test_parameters_are_named_and_drawn_from_their_seed(family: Family) -> None:
@@ -51,6 +52,12 @@ def test_every_mesh_is_usable_and_every_vertex_belongs_to_a_face(family: Family)
     for vertices in family.body.vertices(parameters, family.drawn(5)):
         check_mesh(Mesh(vertices, faces), name="body")
     assert faces.dtype == np.int32 and np.array_equal(np.unique(faces), np.arange(faces.max() + 1))
+
+
+def test_a_vertex_count_that_is_known_before_loading_is_right(family: Family) -> None:
+    made = family.body.vertices(family.identity(0), family.drawn(1)).shape[1]
+    assert family.expected_vertices in (None, made)
+    assert family.expected_vertices is not None or family.name not in ("anny", "leg")
 
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name != "imported"], indirect=True)

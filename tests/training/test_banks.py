@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+from datagen import resources
 from datagen.errors import DatasetError, RecipeError, StorageError
 from datagen.generate import generate
 from datagen.store import Dataset, open_dataset
@@ -88,7 +89,7 @@ def test_every_cache_gives_the_same_bits_in_the_same_order(
         bank = training_bank(legs, cache)
         assert bank.place == cache and equal_steps(steps(bank, legs, count=36, first=4), expected), cache
         bank.close()
-    monkeypatch.setattr(room, "_container_room", lambda: 1)
+    monkeypatch.setattr(resources, "container_memory", lambda: 1)
     cold = training_bank(legs, "mapped")
     assert equal_steps(steps(cold, legs, count=36, first=4), expected), "a file larger than memory is read ahead, too"
     cold.close()
@@ -393,9 +394,9 @@ class TestChoice:
     def test_the_limit_of_a_container_counts(self, tmp_path: Path) -> None:
         for name, value in {"max": "8000", "current": "5000", "stat": "anon 3000\ninactive_file 1500\n"}.items():
             (tmp_path / f"memory.{name}").write_text(value)
-        assert room._container_room(tmp_path) == 4500
+        assert resources.container_memory(tmp_path) == 4500
         (tmp_path / "memory.max").write_text("max\n")
-        assert room._container_room(tmp_path) > 10**15
+        assert resources.container_memory(tmp_path) > 10**15
 
     def test_what_is_free_here_is_known(self, tmp_path: Path) -> None:
         assert 0 < room.memory_room().free < 10**15
