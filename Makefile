@@ -26,7 +26,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster test-slow lint bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
+.PHONY: help run test test-cluster test-slow fuzz lint bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -43,6 +43,9 @@ test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a
 
 test-slow: $(READY) ## every rig and topology of Anny, the real animals (fetched once), torch.compile: some ten minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+fuzz: $(READY) ## damaged and hostile files of every kind that is read, 2,000 cases (ARGS="--cases 500 --minutes 5")
+	@$(BIN)/python -m tests.fuzz $(ARGS)
 
 lint: $(READY) ## style, types, import rules
 	@$(BIN)/ruff check .

@@ -1,0 +1,247 @@
+"""Real files of every kind that is read, small, made once: what a case damages a copy of."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from datagen.generate import generate
+from datagen.mesh import FORMATS, Mesh, save_mesh
+from datagen.mesh_files import read_mesh_file, write_posed
+from datagen.poses import PARENTS, Poses
+from datagen.poses.files import write_pose_file
+from datagen.poses.skeletons import JOINTS
+from datagen.store import open_dataset
+from tests.support.models import random_model, save_npz, save_pickle
+from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.rigged_files import Rig, about
+
+OBJ = """# made by hand
+mtllib look.mtl
+o person
+v 0 0 0 0.1 0.2 0.3
+v 1 0 0 0.1 0.2 0.3
+v 1 1 0 0.1 0.2 0.3
+v 0 1 0 0.1 0.2 0.3
+v 0 0 1 0.1 0.2 0.3
+v 1 0 2 0.1 0.2 0.3
+vt 0 0
+vt 1 0.5
+vn 0 0 -1
+g sides
+usemtl skin
+s off
+f 4/1/1 3/2/1 2/1/1 1/2/1
+f 5/1 6/2 2/1
+usemtl cloth
+f -6//1 -5//1 -1//1
+f 1 2 3 \\
+4
+"""
+LOOK = "newmtl skin\nKd 1 0.5 0.25\nmap_Kd -clamp on skin of me.png\nnewmtl cloth\nKd 0 0 1\nd 0.5\n"
+PLY = """ply
+format ascii 1.0
+comment TextureFile skin of me.png
+element vertex 5
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+element face 3
+property list uchar int vertex_indices
+end_header
+0 0 0 255 0 0
+1 0 0 255 0 0
+0 2 0 0 0 7
+0 0 3 1 1 1
+1 1 1 1 1 1
+3 0 1 2
+4 0 3 4 1
+3 1 2 3
+"""
+STL = """solid thing
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 2 0
+endloop
+endfacet
+facet normal 0 1 0
+outer loop
+vertex 0 0 0
+vertex 0 0 3
+vertex 1 0 0
+endloop
+endfacet
+endsolid thing
+"""
+
+
+class Specimens:
+    """Folders of real files by name, each made when it is first asked for."""
+
+    def __init__(self, home: Path, *, dataset: Path | None = None) -> None:
+        """``dataset``: a tiny dataset of the leg that is there already."""
+        self._home, self._dataset = home, dataset
+
+    def folder(self, name: str) -> Path:
+        """The folder that holds ``leg.zarr``, ``run``, ``workflow`` and so on; not to be changed."""
+        folder = self._home / name
+        if not folder.exists():
+            making = self._home / f".{name}"
+            shutil.rmtree(making, ignore_errors=True)
+            making.mkdir(parents=True)
+            _MAKERS[name](making, self)
+            making.rename(folder)
+        return folder
+
+    @property
+    def dataset(self) -> Path:
+        """The tiny dataset."""
+        return self.folder("dataset") / "leg.zarr"
+
+
+def _make_dataset(folder: Path, specimens: Specimens) -> None:
+    if specimens._dataset is not None:
+        shutil.copytree(specimens._dataset, folder / "leg.zarr")
+    else:
+        generate(tiny_dataset(), str(folder / "leg.zarr"))
+        (folder / "leg.zarr.lock").unlink(missing_ok=True)
+
+
+def _make_run(folder: Path, specimens: Specimens) -> None:
+    """A run of four steps with two checkpoints, its record and its origin; half of it; two meshes to transfer with."""
+    from training.record import begin_record, end_record
+    from training.trainer import train
+    from workflows.pipeline import write_run_head
+
+    recipe = tiny_training(steps=4, checkpoint_every=2, evaluate_every=2, average=0.9)
+    run, dataset = folder / "run", open_dataset(str(specimens.dataset))
+    begin_record(run, name="train", kind="train", parent=None, parameters={"training.batch": "4"})
+    write_run_head(recipe, dataset, run)
+    origin = json.loads((run / "provenance.json").read_text())
+    origin["dataset"]["url"] = "leg.zarr"
+    (run / "provenance.json").write_text(json.dumps(origin))
+    train(recipe, data=str(specimens.dataset), run=run)
+    end_record(run, "FINISHED")
+    shutil.copytree(run, folder / "half")
+    shutil.rmtree(folder / "half" / "checkpoints" / "step-00000004")
+    for name in ("latest", "best"):
+        (folder / "half" / name).write_text("step-00000002\n")
+    save_mesh(Mesh(dataset.vertices(3, 7), dataset.faces(3)), folder / "pose.obj")
+    save_mesh(Mesh(dataset.vertices(4, 0), dataset.faces(4)), folder / "person.obj")
+
+
+def _make_weights(folder: Path, specimens: Specimens) -> None:
+    """Exported weights with their manifest, the same without one, and a state_dict as the authors publish theirs."""
+    import torch
+
+    from training.checkpoint import export_weights, require_checkpoint
+    from training.networks.conversion import to_released_npt
+    from training.networks.npt import NPT
+
+    export_weights(require_checkpoint(specimens.folder("run") / "run"), folder / "weights")
+    (folder / "weights" / "more").mkdir()
+    shutil.copy(folder / "weights" / "weights.safetensors", folder / "weights" / "more" / "alone.safetensors")
+    torch.manual_seed(0)
+    torch.save(to_released_npt(NPT(encoder_widths=(8, 16, 32))), folder / "weights" / "npt.pth")
+
+
+def _make_workflow(folder: Path, specimens: Specimens) -> None:
+    """A workflow's folder: records, marks of its stages, what was sent to MLflow, journals, rows, a figure."""
+    from training.journal import Journal
+    from training.outbox import note_sent
+    from training.record import begin_record, end_record, update_record
+    from training.rows import Row, write_rows
+
+    root = folder / "workflow"
+    begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    journal = Journal(root / "run" / "metrics.jsonl")
+    for step in range(1, 6):
+        journal.write(step, {"loss/total": 1 / step, "learning_rate": 0.1})
+    journal.close()
+    (root / "run" / "figures").mkdir()
+    (root / "run" / "figures" / "curve.png").write_bytes(b"png")
+    write_rows([Row("DSFFNet", "seen", 3, 1, 2, 3, 4, *[0.5] * 7)] * 3, root / "run" / "rows.csv")
+    about_data = {"name": "leg.zarr", "url": "leg.zarr", "manifest_sha256": "0" * 64}
+    update_record(root / "run", artifacts=["figures", "rows.csv"], metrics={"final": 0.5}, dataset=about_data)
+    end_record(root / "run", "FINISHED")
+    first = (root / "run" / "metrics.jsonl").read_bytes().index(b"\n") + 1
+    sent = {"run": "0" * 32, "offsets": {"metrics.jsonl": first}, "artifacts": {}}
+    note_sent(root / "run", "sqlite:///mlflow.db", sent)
+    (root / "stages").mkdir()
+    (root / "stages" / "generate.json").write_text(json.dumps({"fingerprint": "0" * 64, "seconds": 1.5}))
+
+
+def _make_recipe(folder: Path, specimens: Specimens) -> None:
+    import yaml
+
+    from workflows.recipe import load_recipe
+
+    for name in ("quickstart", "smoke", "smpl-paper"):
+        recipe = load_recipe(name).model_dump(mode="json")
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
+
+
+def _make_mesh(folder: Path, specimens: Specimens) -> None:
+    """Each format with all that it can hold, in a folder of its own with the files that belong to it."""
+    home = folder / "obj"
+    home.mkdir()
+    (home / "mesh.obj").write_text(OBJ)
+    (home / "look.mtl").write_text(LOOK)
+    (home / "skin of me.png").write_bytes(b"\x89PNG\r\n\x1a\n and so on")
+    for suffix in ("ply", "glb", "off", "stl"):
+        (folder / suffix).mkdir()
+        read = read_mesh_file(home / "mesh.obj")
+        write_posed(read, read.mesh.vertices, folder / suffix / f"mesh.{suffix}")
+    for suffix, text in (("ply", PLY), ("stl", STL)):
+        (folder / f"{suffix} text").mkdir()
+        (folder / f"{suffix} text" / f"mesh.{suffix}").write_text(text)
+
+
+def _make_plain(folder: Path, specimens: Specimens) -> None:
+    """Vertices and faces alone, as data sets have them."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
+    for suffix in FORMATS:
+        save_mesh(Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])), folder / f"mesh{suffix}")
+
+
+def _make_character(folder: Path, specimens: Specimens) -> None:
+    rig = Rig()
+    turns = [about("x", angle) for angle in (0, 20, 0)]
+    rig.clips = {"walk": {"Leg.L": rig.keys("Leg.L", turns, [0.0, 0.5, 1.0])}}
+    for name in ("rig.glb", "rig.gltf"):
+        (folder / name.replace(".", " ")).mkdir()
+        rig.document().save(folder / name.replace(".", " ") / name)
+
+
+def _make_poses(folder: Path, specimens: Specimens) -> None:
+    rotations = np.random.default_rng(0).normal(0, 0.3, (6, len(JOINTS), 3))
+    write_pose_file(folder / "poses.npz", Poses(tuple(JOINTS), tuple(PARENTS), rotations))
+    np.savez(folder / "motion.npz", poses=np.zeros((40, 66)), trans=np.zeros((40, 3)), gender=np.array("male"))
+
+
+def _make_model(folder: Path, specimens: Specimens) -> None:
+    arrays = random_model(tuple(PARENTS), vertices=40, betas=4)
+    save_npz(folder / "model.npz", arrays)
+    save_pickle(folder / "model.pkl", arrays)
+
+
+def _make_server(folder: Path, specimens: Specimens) -> None:
+    """An MLflow store with its tables, which take seconds to make."""
+    import mlflow
+
+    mlflow.MlflowClient(f"sqlite:///{folder / 'mlflow.db'}").search_experiments()
+
+
+_MAKERS: dict[str, Callable[[Path, Specimens], None]] = {
+    "dataset": _make_dataset, "run": _make_run, "weights": _make_weights, "workflow": _make_workflow,
+    "recipe": _make_recipe, "mesh": _make_mesh, "plain": _make_plain, "character": _make_character,
+    "poses": _make_poses, "model": _make_model, "server": _make_server,
+}  # fmt: skip
