@@ -6,6 +6,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 from tests.fuzz import archives, structures
@@ -22,8 +23,11 @@ _MEANINGS: dict[str, Content] = {
 """Suffixes of files whose content is understood, and what changes their meaning."""
 
 
-def mutate(tree: Path, rng: random.Random, canary: Path) -> str:
-    """Damage one thing in a tree, or in a file, in place; words of what."""
+def mutate(tree: Path, rng: random.Random, canary: Path, *, named: str = "") -> str:
+    """Damage one thing in a tree, or in a file, in place; words of what.
+
+    ``named``: a pattern of files that a person names, and which are no links to elsewhere therefore.
+    """
     files = [path for path in (sorted(tree.rglob("*")) if tree.is_dir() else [tree]) if is_plain(path)]
     if not files:
         return "nothing is left to damage"
@@ -32,7 +36,9 @@ def mutate(tree: Path, rng: random.Random, canary: Path) -> str:
         return _change_meaning(files, rng, canary)
     if draw < 0.75:
         return _change_bytes(_weighted(files, rng), rng)
-    return rng.choice(_KINDS)(tree, files, rng, canary)
+    change = rng.choice(_KINDS)
+    others = [path for path in files if change is not _lead_out or not fnmatch(path.name, named)]
+    return change(tree, others, rng, canary) if others else _special(tree, files, rng, canary)
 
 
 def reseal(tree: Path) -> None:

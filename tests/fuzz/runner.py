@@ -119,7 +119,8 @@ class Runner:
         stored = self._stored(plan)
         with self._arena(plan) as arena:
             canary, tree = _canary(arena.parent), arena / plan.tree
-            damage = [mutate(tree, random.Random(each), canary) for each in plan.mutations]
+            named = FAMILIES[plan.family].named
+            damage = [mutate(tree, random.Random(each), canary, named=named) for each in plan.mutations]
             if plan.is_sealed:
                 reseal(tree)
                 damage.append("hashes made to fit")

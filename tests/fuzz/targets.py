@@ -36,12 +36,14 @@ class Target:
 class Family:
     """What is damaged: the folder of specimens it comes with, the path in it, and who reads it.
 
-    ``trees`` are patterns in that folder, one of whose paths is damaged in a case; the rest of the folder stays.
+    ``trees`` is a pattern in that folder, one of whose paths is damaged in a case; the rest of the folder stays.
+    ``named``: files in it that a person names, which may be links as that person likes.
     """
 
     specimen: str
     trees: str
     targets: tuple[Target, ...]
+    named: str = ""
 
 
 def _command(*words: str) -> Read:
@@ -301,9 +303,9 @@ FAMILIES: dict[str, Family] = {
         "*.yaml",
         (Target("recipe", _command("recipe", "--recipe", "{}")), Target("training", _recipe_in)),
     ),
-    "mesh": Family("mesh", "*", (Target("written again", _mesh), Target("sequence", _sequence))),
+    "mesh": Family("mesh", "*", (Target("written again", _mesh), Target("sequence", _sequence)), named="mesh.*"),
     "plain-mesh": Family("plain", "mesh.*", (Target("plain", _plain_mesh),)),
-    "character": Family("character", "*", (Target("character", _character),)),
+    "character": Family("character", "*", (Target("character", _character),), named="rig.*"),
     "poses": Family("poses", "poses.npz", (Target("poses", _poses),)),
     "motion": Family("poses", "motion.npz", (Target("motion", _motion),)),
     "model": Family(
