@@ -132,10 +132,10 @@ def _renamed(members: dict[str, bytes], name: str, rng: random.Random, canary: s
 
 
 def _bomb(members: dict[str, bytes], name: str, rng: random.Random, canary: str) -> str:
-    """400 MB of zeros in 400 kB."""
-    rows = 400 * 2**20 // 24
+    """200 MB of zeros in 1 MB."""
+    rows = 200 * 2**20 // 24
     members[name] = _saved(np.zeros((1, 3)))[:128].replace(b"(1, 3), }       ", b"(%d, 3), }" % rows) + bytes(rows * 24)
-    return "is 400 MB of zeros"
+    return "is 200 MB of zeros"
 
 
 def _members(content: bytes) -> dict[str, bytes]:
@@ -145,7 +145,9 @@ def _members(content: bytes) -> dict[str, bytes]:
 
 def _packed(members: dict[str, bytes], *, compressed: bool = False) -> bytes:
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED) as archive:
+    with zipfile.ZipFile(
+        out, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED, compresslevel=1
+    ) as archive:
         for name, content in members.items():
             archive.writestr(zipfile.ZipInfo(name or "."), content, archive.compression)
     return out.getvalue()

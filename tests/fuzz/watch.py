@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 WALL_SECONDS, CPU_SECONDS = 20, 15  # of one case, on a busy machine
-MEMORY = 300 * 2**20  # bytes that one case may take beside what was taken before it
+MEMORY = 150 * 2**20  # bytes that one case may take beside what was taken before it
 _ADDRESSES = 3 * 2**30  # bytes that can be allocated at all, lest a case takes the machine
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _ROOT = Path(__file__).parents[2]
