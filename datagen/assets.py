@@ -1,5 +1,6 @@
 """What data was made from: packages and files, with licence and hash, so that the same bytes can be made again."""
 
+import errno
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
         It cannot be read.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise OSError(errno.EINVAL, "it is no regular file")  # opening a pipe would wait
         with open(path, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:

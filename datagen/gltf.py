@@ -6,10 +6,9 @@ trimesh drops skins and clips, and what is needed here is small. Section numbers
 """
 
 import base64
-import json
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from datagen.errors import BodyError
+from datagen.errors import BodyError, UnsafeFileError
+from datagen.files import read_bounded, resolve_within
+from datagen.mesh_limits import parse_json
 
 SUFFIXES = (".glb", ".gltf")
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -28,7 +29,9 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 _LISTS = ("nodes", "accessors", "bufferViews", "buffers", "skins", "meshes", "animations")
-_LARGEST = 2**30  # bytes of an accessor; a million vertices' positions have 12 MB
+LARGEST = 2**30
+"""Bytes at most of a file, of the files beside it, and of all that is taken out of it; a million vertices' positions
+have 12 MB."""
 _DAMAGE = (
     LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
     np.linalg.LinAlgError,
@@ -61,6 +64,8 @@ class Gltf:
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
         self._binary: bytes | None = None
+        self._taken: dict[Hashable, int] = {}
+        self._total = 0
         self.json = self._parse()
         packed = [str(name) for name in self.json.get("extensionsRequired", ()) if "compression" in str(name)]
         if packed:
@@ -121,15 +126,32 @@ class Gltf:
     def accessor(self, number: int) -> NDArray[Any]:
         """Elements [count, width] of an accessor (3.6.2): strided, sparse and normalised ones included."""
         with reading(self.path, f"accessor {number}"):
-            return self._accessor(self.json["accessors"][number])
+            return self._accessor(number)
 
-    def _accessor(self, accessor: Json) -> NDArray[Any]:
+    def require_room(self, what: Hashable, size: int) -> None:
+        """Count bytes that are taken out of the file, once for each ``what``: many entries may name the same ones.
+
+        Raises
+        ------
+        ValueError
+            It is more than any file holds.
+        """
+        if size < 0:
+            raise ValueError("a size is below 0")
+        if what not in self._taken:
+            self._taken[what] = size
+            self._total += size
+        if self._total > LARGEST:
+            raise ValueError(f"what it describes takes {self._total:,} bytes, more than any character has")
+
+    def _accessor(self, number: int) -> NDArray[Any]:
+        accessor = self.json["accessors"][number]
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
-        if not 0 <= count * width * kind.itemsize <= _LARGEST:
-            raise ValueError(f"{count} elements are more than any character has")
-        values = np.zeros((count, width), kind)
+        self.require_room(("accessor", number), count * width * kind.itemsize)
         if "bufferView" in accessor:
             values = self._elements(accessor["bufferView"], accessor.get("byteOffset", 0), kind, count, width)
+        else:
+            values = np.zeros((count, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
             where, what = sparse["indices"], sparse["values"]
@@ -147,17 +169,20 @@ class Gltf:
     def _elements(self, view: int, offset: int, kind: "np.dtype[Any]", count: int, width: int) -> NDArray[Any]:
         where = self.json["bufferViews"][view]
         start, size = where.get("byteOffset", 0) + offset, width * kind.itemsize
-        stride = where.get("byteStride", size)
-        if offset + (count - 1) * stride + size > where["byteLength"]:
+        stride = where.get("byteStride") or size
+        if stride < size or offset + (count - 1) * stride + size > where["byteLength"]:
             raise ValueError(f"{count} elements do not fit into buffer view {view}")
         buffer = self._buffers[where["buffer"]]
         return np.ndarray((count, width), kind, buffer, start, (stride, kind.itemsize))
 
     @cached_property
     def _buffers(self) -> list[bytes]:
-        return [self._buffer(number, each) for number, each in enumerate(self.json.get("buffers", ()))]
+        found: list[bytes] = []
+        for number, each in enumerate(self.json.get("buffers", ())):
+            found.append(self._buffer(number, each, LARGEST - sum(map(len, found))))
+        return found
 
-    def _buffer(self, number: int, buffer: Json) -> bytes:
+    def _buffer(self, number: int, buffer: Json, limit: int) -> bytes:
         uri = buffer.get("uri")
         if uri is None:
             if number or self._binary is None:
@@ -167,7 +192,7 @@ class Gltf:
             return base64.b64decode(uri.partition(",")[2])
         beside = self._beside(uri)
         try:
-            return beside.read_bytes()
+            return read_bounded(beside, limit=limit)
         except OSError as error:
             raise BodyError(f"{self.path} needs {beside}, which cannot be read ({error.strerror})") from error
 
@@ -179,15 +204,17 @@ class Gltf:
             return [self.path, *(self._beside(uri) for uri in uris if not uri.startswith("data:"))]
 
     def _beside(self, uri: str) -> Path:
-        beside = Path(os.path.normpath(self.path.parent / unquote(uri)))
-        if self.path.parent not in beside.parents:
-            raise BodyError(f"{self.path} names a file outside of its folder: {uri}. Put its buffers beside it")
-        return beside
+        try:
+            return resolve_within(self.path.parent, os.path.normpath(unquote(uri)))
+        except UnsafeFileError as error:
+            raise BodyError(
+                f"{self.path} names a file outside of its folder: {uri}. Put its buffers beside it"
+            ) from error
 
     def _parse(self) -> Json:
         try:
-            content = self.path.read_bytes()
-            parsed = json.loads(self._json_chunk(content) if content[:4] == b"glTF" else content)
+            content = read_bounded(self.path, limit=LARGEST)
+            parsed = parse_json(self._json_chunk(content) if content[:4] == b"glTF" else content)
             if str(parsed["asset"]["version"]).split(".")[0] != "2":
                 raise ValueError(f"glTF version {parsed['asset']['version']}")
             for name in _LISTS:

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import BodyError
+from datagen.errors import BodyError, UnsafeFileError
+from datagen.files import read_bounded
 from datagen.grid import POSE_TYPES, Grid, PoseType
 from datagen.layouts import Cell, FoundMeshes, Layout, find_meshes
 from datagen.recipe import DatasetRecipe, ImportedBody, MixedBody
 
+_LIST_LIMIT = 2**26  # bytes; a million triples have some 40 MB
 Counts = tuple[int, int, int, int]
 """Training and evaluation identities, seen and unseen poses."""
 
@@ -159,8 +161,8 @@ def read_test_list(path: str | Path, meshes: FoundMeshes) -> NDArray[np.int32]:
         No such file, or a line that is no such triple; the message has its number.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_bounded(Path(path), limit=_LIST_LIMIT).decode().splitlines()
+    except (OSError, UnicodeDecodeError, UnsafeFileError) as error:
         raise BodyError(
             f"the test list {path} cannot be read ({error}). Name it: --set data.body.test_list=FILE"
         ) from error

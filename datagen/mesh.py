@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import MeshError, storage_errors
-from datagen.files import sync_folder
+from datagen.files import read_bounded, sync_folder
 from datagen.obj import read_plain
 
+_SMALLEST, _LARGEST = 1e-15, 1e15  # of a box and of coordinates, in any unit that a body is measured in
 FORMATS = (".obj", ".ply", ".off", ".glb", ".stl")
 
 
@@ -91,22 +92,27 @@ def load_mesh(path: str | Path) -> Mesh:
     MeshError
         The file is missing, of an unknown format, unreadable, or not one usable triangle mesh.
     """
+    from datagen.mesh_limits import BYTE_LIMIT, refuse_huge, require_file
+
     path = Path(path)
-    if not path.is_file():
-        raise MeshError(f"no mesh file at {path}")
-    if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
-    return check_mesh(_single_geometry(path), name=str(path))
+    require_file(path)
+    try:
+        refuse_huge(path)
+        content = read_bounded(path, limit=BYTE_LIMIT)
+    except (OSError, ValueError, LookupError) as error:
+        raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
+    return check_mesh(_single_geometry(path, content), name=str(path))
 
 
-def _single_geometry(path: Path) -> Mesh:
+def _single_geometry(path: Path, content: bytes) -> Mesh:
     import trimesh
 
+    is_obj = path.suffix.lower() == ".obj"
     try:
-        plain = read_plain(path.read_bytes()) if path.suffix.lower() == ".obj" else None
+        plain = read_plain(content) if is_obj else None
         if plain:
             return Mesh(*plain)
-        source: Any = _plain_obj(path) if path.suffix.lower() == ".obj" else path
+        source = io.BytesIO(_plain_obj(content) if is_obj else content)  # no path: trimesh would read what a file names
         scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, maintain_order=True)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     except Exception as error:  # trimesh's readers raise whatever their parsers raise
@@ -118,16 +124,16 @@ def _single_geometry(path: Path) -> Mesh:
     return Mesh(np.asarray(parts[0].vertices, np.float64), np.asarray(parts[0].faces, np.int64))
 
 
-def _plain_obj(path: Path) -> io.BytesIO:
+def _plain_obj(content: bytes) -> bytes:
     """Positions and faces of an OBJ file. Materials, groups and texture seams would split its one list of vertices."""
     kept = []
-    for line in path.read_bytes().replace(b"\\\n", b" ").splitlines():
+    for line in content.replace(b"\\\n", b" ").splitlines():
         words = line.split()
         if words and words[0] == b"v":
             kept.append(line)
         elif words and words[0] == b"f":
             kept.append(b" ".join([b"f", *(word.split(b"/")[0] for word in words[1:])]))
-    return io.BytesIO(b"\n".join(kept) + b"\n")
+    return b"\n".join(kept) + b"\n"
 
 
 def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
@@ -148,9 +154,19 @@ def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
         raise MeshError(f"{name}: {len(wrong)} vertices are not finite, the first is number {wrong[0]}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{name}: faces name vertex {faces.max()}, but there are {len(vertices)}")
-    if not bounding_box(vertices).half > 0:
-        raise MeshError(f"{name} has no extent: all vertices are at {vertices[0].tolist()}")
+    _require_extent(vertices, name)
     return mesh
+
+
+def _require_extent(vertices: NDArray[np.floating], name: str) -> None:
+    largest = float(np.abs(vertices).max())
+    if largest > _LARGEST:  # its square may not be finite
+        raise MeshError(f"{name} has coordinates up to {largest:.3g}: scale it to metres or millimetres")
+    edge = 2 * float(bounding_box(vertices).half)
+    if not edge > 0:
+        raise MeshError(f"{name} has no extent: all vertices are at {vertices[0].tolist()}")
+    if edge < _SMALLEST:
+        raise MeshError(f"{name} is {edge:.3g} long at most: scale it to metres or millimetres")
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.errors import BodyError, MeshError, StorageError
+from datagen.files import read_bounded
 from datagen.mesh import Mesh, check_mesh, write_atomically
 from datagen.mesh_glb_built import built_draft, built_glb
 from datagen.mesh_glb_written import Draft
-from datagen.mesh_limits import refuse_huge, require_file, require_known, require_thickness
+from datagen.mesh_limits import BYTE_LIMIT, refuse_huge, require_file, require_known, require_thickness
 from datagen.mesh_obj import ObjContent
 from datagen.mesh_obj_built import built_obj, one_word
 from datagen.mesh_plain import OffContent, StlContent, built_off, built_stl
@@ -104,7 +105,7 @@ def _one_line(reason: object) -> str:
 def _content(path: Path, geometry: str | None) -> Content:
     if path.suffix.lower() == ".glb":
         return _glb_content(path, geometry)
-    content = _TEXTS[path.suffix.lower()](path.read_bytes(), path)
+    content = _TEXTS[path.suffix.lower()](read_bounded(path, limit=BYTE_LIMIT), path)
     if geometry is not None:
         raise MeshError(
             f"{path} is one mesh as a whole; only a GLB has geometries to choose: save {geometry!r} by itself"
@@ -223,7 +224,7 @@ def _folder(path: Path) -> Path:
 
 def _write_beside(out: Path, name: str, content: bytes) -> list[str]:
     place = out.parent / name
-    if place.is_file() and place.read_bytes() == content:
+    if place.is_file() and place.stat().st_size == len(content) and place.read_bytes() == content:
         return []
     called_after = re.fullmatch(rf"({re.escape(out.stem)}|{re.escape(one_word(out.stem))})(-\d+)?\.\w+", name)
     if place.exists() and not called_after:

@@ -1,12 +1,13 @@
 """A GLB file's scene: which of its nodes have a mesh, and what their materials look like."""
 
 import base64
-from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 
-from datagen.gltf import Gltf
+from datagen.errors import UnsafeFileError
+from datagen.files import read_bounded, resolve_within
+from datagen.gltf import LARGEST, Gltf
 from datagen.mesh_glb_written import Json
 from datagen.mesh_surface import Image, Material
 
@@ -47,7 +48,8 @@ def base_texture(file: GlbFile, number: int) -> Json:
 def read_material(file: GlbFile, number: int) -> Material:
     """Name, base colour and its texture."""
     material = file.json["materials"][number]
-    red, green, blue, alpha = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1, 1, 1, 1))
+    look = material.get("pbrMetallicRoughness", {})
+    red, green, blue, alpha = map(float, look.get("baseColorFactor", (1, 1, 1, 1)))
     texture = base_texture(file, number).get("index")
     image = None
     if texture is not None and "source" in file.json["textures"][texture]:
@@ -63,11 +65,18 @@ def _image(file: GlbFile, number: int) -> Image | None:
 
 def image_bytes(file: GlbFile, image: Json) -> bytes | None:
     """The bytes of an image inside the file, or in a file beside it; None where they are nowhere."""
+    content = _image_content(file, image)
+    file.require_room(("image", id(image)), len(content or b""))
+    return content
+
+
+def _image_content(file: GlbFile, image: Json) -> bytes | None:
     if "bufferView" in image:
         return file.view(image["bufferView"])
     uri = str(image.get("uri", ""))
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition(",")[2])
-    named = Path(unquote(uri))
-    outside = named.is_absolute() or ".." in named.parts or not uri  # another's files are not to be carried off
-    return (file.path.parent / named).read_bytes() if not outside and (file.path.parent / named).is_file() else None
+    try:  # another's files are not to be carried off
+        return read_bounded(resolve_within(file.path.parent, unquote(uri)), limit=LARGEST)
+    except (UnsafeFileError, OSError, ValueError):
+        return None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from datagen.mesh_glb_scene import SOLID, GlbFile, base_texture, image_bytes, read_material, solid_nodes
 from datagen.mesh_glb_written import Block, Draft, GlbParts, Json
+from datagen.mesh_limits import require_counts
 from datagen.mesh_surface import Encoded, Image, Surface, numbered, srgb
 from datagen.skins import triangles
 
@@ -56,9 +57,11 @@ class GlbContent:
             if primitive.get("mode", 4) in SOLID and accessor not in starts and accessor is not None:
                 starts[accessor] = total
                 total += self._file.json["accessors"][accessor]["count"]
+        require_counts(vertices=total)
         return starts
 
     def _read_pieces(self) -> Iterator[Piece]:
+        total = 0
         for number, primitive in enumerate(self._mesh["primitives"]):
             mode, accessor = primitive.get("mode", 4), primitive.get("attributes", {}).get("POSITION")
             if mode in SOLID and accessor is not None:
@@ -68,7 +71,17 @@ class GlbContent:
                     corners = self._file.accessor(primitive["indices"]).ravel().astype(np.int64)
                 if corners.size and corners.max() >= size:
                     raise ValueError(f"a face names vertex {corners.max()}, but there are {size} (from 0)")
+                total += len(corners)
+                require_counts(corners=total)
+                self._require_alike(primitive["attributes"], size)
                 yield Piece(number, primitive, self._starts[accessor], triangles(corners, mode).ravel())
+
+    def _require_alike(self, attributes: Json, size: int) -> None:
+        """Refuse attributes of another count than the positions (3.7.2.1): they would be copied as they are."""
+        for name, number in attributes.items():
+            there = self._file.json["accessors"][number]["count"]
+            if there != size:
+                raise ValueError(f"{name} has {there} elements for {size} vertices")
 
     @property
     def _firsts(self) -> list[Piece]:

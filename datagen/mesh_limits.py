@@ -1,9 +1,10 @@
 """What is refused: files that are too large, before they are read whole, and shapes that cannot be posed."""
 
 import json
+import os
 import struct
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,30 +15,71 @@ from datagen.mesh_plain import is_binary_stl
 from datagen.mesh_ply_layout import read_header
 
 VERTEX_LIMIT = 2_000_000
-"""Vertices of a mesh at most. At the limit reading an OBJ file takes some 2 GB and 20 s (measured at a quarter of it:
-0.43 GB, 5.1 s) and the network far more; bodies for animation have a thousandth of it."""
+"""Vertices of a mesh at most; bodies for animation have a thousandth of it. What they take: docs/transfer.md."""
 BYTE_LIMIT = 2**30
+_CORNER_LIMIT = 12 * VERTEX_LIMIT  # of faces: a closed surface has two triangles a vertex, an open or torn one fewer
+_LINE_LIMIT = 15 * VERTEX_LIMIT  # of a text: STL has seven lines a triangle
+_WORD_LIMIT = 24 * VERTEX_LIMIT  # of a text: OBJ has some 19 words a vertex
+_STL_WORD_LIMIT = 45 * VERTEX_LIMIT  # of 21 a triangle, most of which its reader passes over
+_JSON_VALUES = 2**22  # of a glTF file; each takes some 100 bytes
 _BLOCK = 2**22
 _FLAT = 1e-6  # of the longest edge of the bounding box
-_JSON_LIMIT = 2**28
+_SPACES = bytes.maketrans(b"\t\r\n\v\f", b"     ")
 
 
 def refuse_huge(path: Path) -> None:
-    """Refuse a mesh file with too many vertices, by its header or by counting; at most 4 MB of it are in memory.
+    """Refuse a mesh file with too many vertices, by its header or by counting; a few MB of it are in memory.
 
     Raises
     ------
     MeshError
-        More than ``VERTEX_LIMIT`` vertices, or more than ``BYTE_LIMIT`` bytes.
+        More than ``VERTEX_LIMIT`` vertices, or more than ``BYTE_LIMIT`` bytes, or a text of far too many lines or words
+        for so many vertices.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
+        advice = "decimate it (for example in Blender or MeshLab) and try again"
+        if size > BYTE_LIMIT:
+            raise MeshError(f"{path} has {size:,} bytes, more than {BYTE_LIMIT:,}: {advice}")
         found = _COUNTS[path.suffix.lower()](file, size)
-    advice = "decimate it (for example in Blender or MeshLab) and try again"
-    if found > VERTEX_LIMIT:
-        raise MeshError(f"{path} has more than {VERTEX_LIMIT:,} vertices ({found:,} counted): {advice}")
-    if size > BYTE_LIMIT:
-        raise MeshError(f"{path} has {size:,} bytes, more than {BYTE_LIMIT:,}: {advice}")
+        if found > VERTEX_LIMIT:
+            raise MeshError(f"{path} has more than {VERTEX_LIMIT:,} vertices ({found:,} counted): {advice}")
+        file.seek(0)
+        if size > _LINE_LIMIT and _is_text(file.read(_BLOCK), path.suffix.lower(), size):
+            file.seek(0)
+            _refuse_long_text(file, path)
+
+
+def _is_text(beginning: bytes, suffix: str, size: int) -> bool:
+    if suffix == ".ply":
+        return read_header(beginning).form == "ascii"
+    return suffix != ".glb" and not (suffix == ".stl" and is_binary_stl(beginning[:84], size))
+
+
+def _refuse_long_text(file: IO[bytes], path: Path) -> None:
+    limit = _STL_WORD_LIMIT if path.suffix.lower() == ".stl" else _WORD_LIMIT
+    lines = words = 0
+    while block := file.read(_BLOCK):
+        lines += block.count(b"\n") + block.count(b"\r")
+        words += block.translate(_SPACES).count(b" ")
+        if lines > _LINE_LIMIT or words > limit:
+            raise MeshError(f"{path} has more lines or words than {VERTEX_LIMIT:,} vertices need: is it damaged?")
+
+
+def require_counts(*, vertices: int = 0, corners: int = 0) -> None:
+    """Refuse counts beyond those of the largest mesh, before memory is taken for them (ValueError)."""
+    if not 0 <= vertices <= VERTEX_LIMIT:
+        raise ValueError(f"it has {vertices:,} vertices, at most {VERTEX_LIMIT:,} are read")
+    if not 0 <= corners <= _CORNER_LIMIT:
+        raise ValueError(f"its faces have {corners:,} corners, at most {_CORNER_LIMIT:,} are read")
+
+
+def parse_json(text: bytes) -> Any:
+    """What a JSON text says; ValueError where it is none, or has so many values that they would fill the memory."""
+    values = sum(text.count(mark) for mark in (b",", b"[", b"{"))
+    if values > _JSON_VALUES:
+        raise ValueError(f"its JSON has {values:,} values, more than {_JSON_VALUES:,}")
+    return json.loads(text)
 
 
 def _in_obj(file: IO[bytes], size: int) -> int:
@@ -54,7 +96,8 @@ def _in_obj(file: IO[bytes], size: int) -> int:
 
 def _in_ply(file: IO[bytes], size: int) -> int:
     header = read_header(file.read(_BLOCK))
-    return max(header.count("vertex"), header.count("face") // 4)
+    others = sum(element.count for element in header.elements if element.name != "vertex")
+    return max(header.count("vertex"), others // 4)
 
 
 def _in_off(file: IO[bytes], size: int) -> int:
@@ -76,7 +119,7 @@ def _in_glb(file: IO[bytes], size: int) -> int:
     if head[:4] != b"glTF" or len(head) < 20:
         return 0
     length = struct.unpack_from("<I", head, 12)[0]
-    described = json.loads(file.read(min(length, _JSON_LIMIT)))
+    described = parse_json(file.read(length))
     primitives = [each for mesh in described.get("meshes", ()) for each in mesh.get("primitives", ())]
     used = {each.get("attributes", {}).get("POSITION") for each in primitives}
     return max((described["accessors"][number]["count"] for number in used if number is not None), default=0)
@@ -87,10 +130,10 @@ _COUNTS = {".obj": _in_obj, ".ply": _in_ply, ".off": _in_off, ".stl": _in_stl, "
 
 def require_file(path: Path) -> None:
     """Refuse what is no file, of no known format, or empty (MeshError)."""
-    if path.is_dir():
+    if os.path.isdir(path):
         raise MeshError(f"{path} is a folder; name a mesh file in it")
-    if not path.is_file():
-        raise MeshError(f"no mesh file at {path}")
+    if not os.path.isfile(path):  # Path's own raises on names that are too long
+        raise MeshError(f"{path} is not a regular file" if os.path.exists(path) else f"no mesh file at {path}")
     require_known(path)
     if path.stat().st_size == 0:
         raise MeshError(f"{path} is empty (0 bytes): export or copy it again")

@@ -1,11 +1,64 @@
-"""Material libraries (.mtl) of OBJ files: what they say of base colours, and the files that go with them."""
+"""Files that a mesh names: material libraries (.mtl) of OBJ files, what they say of base colours, and textures."""
 
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from datagen.errors import UnsafeFileError
+from datagen.files import read_bounded, resolve_within
 from datagen.mesh_surface import Image, Material
 
+NAMED_LIMIT = 2**30
+"""Bytes at most of all files together that one mesh names: they are in memory until the mesh is written."""
+_LIBRARY_LIMIT = 2**24
+_MOST_FILES = 1_000  # that one mesh names
 _TEXTURES = ("map_", "bump", "disp", "decal", "norm", "refl")
+_NAME_WORDS = 32  # of a texture line that a name with spaces may take up
+
+
+class NamedFiles:
+    """Files that a mesh names, read from its own folder and below.
+
+    Attributes
+    ----------
+    contents
+        Name -> bytes of what was read.
+    missing
+        What could not be read, one line each.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.contents: dict[str, bytes] = {}
+        self.missing: list[str] = []
+
+    def read(self, name: str, what: str, *, limit: int = NAMED_LIMIT) -> bytes | None:
+        """The bytes of a file; None where it is not to be had, which is noted. An absolute path stays as it is."""
+        if PurePosixPath(name).is_absolute() or len(self.missing) >= _MOST_FILES:
+            return None
+        if name not in self.contents:
+            try:
+                self.contents[name] = self._content(name, limit)
+            except UnsafeFileError as error:
+                self.missing.append(f"{what}: {name} was not copied: {error}")
+            except (OSError, ValueError):
+                self.missing.append(f"{what}: {name} is not beside the mesh")
+        return self.contents.get(name)
+
+    def _content(self, name: str, limit: int) -> bytes:
+        if len(self.contents) >= _MOST_FILES:
+            raise UnsafeFileError(f"the mesh names more than {_MOST_FILES:,} files")
+        try:
+            path = resolve_within(self.folder, name)
+        except UnsafeFileError as error:
+            raise UnsafeFileError("it lies outside of the mesh's folder") from error
+        left = NAMED_LIMIT - sum(map(len, self.contents.values()))
+        return read_bounded(path, limit=min(limit, left))
+
+    def holds(self, name: str) -> bool:
+        """Whether a file of that name is there."""
+        return os.path.isfile(self.folder / name)  # Path's own raises on names that are too long
 
 
 @dataclass(frozen=True)
@@ -19,47 +72,29 @@ class LibraryFiles:
 
 def read_library(folder: Path, lines: list[str]) -> LibraryFiles:
     """Read the libraries that ``mtllib`` lines name, with their textures, from the folder of the OBJ file."""
+    files = NamedFiles(folder)
     materials: list[Material] = []
-    beside: dict[str, bytes] = {}
-    missing: list[str] = []
-    for name in (name for line in dict.fromkeys(lines) for name in _library_names(folder, line)):
-        content = _beside(folder, name, "materials", missing)
+    for name in dict.fromkeys(name for line in dict.fromkeys(lines) for name in _library_names(files, line)):
+        content = files.read(name, "materials", limit=_LIBRARY_LIMIT)
         if content is not None:
-            beside[name] = content
-            materials += _parse(content.decode("utf-8", "replace"), folder, PurePosixPath(name).parent, beside, missing)
-    return LibraryFiles(tuple(materials), beside, missing)
+            materials += _parse(content.decode("utf-8", "replace"), files, PurePosixPath(name).parent)
+    return LibraryFiles(tuple(materials), files.contents, files.missing)
 
 
-def _library_names(folder: Path, line: str) -> list[str]:
-    return [line] if " " not in line or (folder / line).is_file() else line.split()
+def _library_names(files: NamedFiles, line: str) -> list[str]:
+    return [line] if " " not in line or files.holds(line) else line.split()
 
 
-def _beside(folder: Path, name: str, what: str, missing: list[str]) -> bytes | None:
-    """The bytes of a file that another one names; what cannot be taken along is noted in ``missing``."""
-    place = PurePosixPath(name)
-    try:
-        if place.is_absolute():
-            return None  # stays right wherever the mesh goes
-        if ".." in place.parts:
-            missing.append(f"{what}: {name} lies outside of the mesh's folder and was not copied")
-            return None
-        return (folder / name).read_bytes()
-    except (OSError, ValueError):
-        missing.append(f"{what}: {name} is not beside the mesh")
-        return None
-
-
-def _parse(text: str, home: Path, sub: PurePosixPath, beside: dict[str, bytes], missing: list[str]) -> list[Material]:
-    """Materials of a library that lies in the folder ``sub`` of ``home``; textures are named from there."""
+def _parse(text: str, files: NamedFiles, sub: PurePosixPath) -> list[Material]:
+    """Materials of a library that lies in the folder ``sub``; textures are named from there."""
     entries = _entries(text)
-    folder = home / sub
     images: dict[str, Image] = {}
-    for name in dict.fromkeys(_file_name(folder, entry[key]) for entry in entries for key in entry if _is_texture(key)):
-        content = _beside(folder, name, "texture", missing)
+    for value in dict.fromkeys(entry[key] for entry in entries for key in entry if _is_texture(key)):
+        name = _file_name(files, sub, value)
+        content = files.read(str(sub / name), "texture") if name else None
         if content is not None:
-            beside[str(sub / name)] = content
-            images[name] = Image(PurePosixPath(name).name, content)
-    return [_material(entry, images.get(_file_name(folder, entry.get("map_Kd", "")))) for entry in entries]
+            images[value] = Image(PurePosixPath(name).name, content)
+    return [_material(entry, images.get(entry.get("map_Kd", ""))) for entry in entries]
 
 
 def _entries(text: str) -> list[dict[str, str]]:
@@ -77,10 +112,10 @@ def _is_texture(key: str) -> bool:
     return key.lower().startswith(_TEXTURES)
 
 
-def _file_name(folder: Path, value: str) -> str:
+def _file_name(files: NamedFiles, sub: PurePosixPath, value: str) -> str:
     """The file of a texture line, whose options come before it; a name with spaces is told by its file."""
-    words = value.split()
-    while len(words) > 1 and not (folder / " ".join(words)).is_file():
+    words = value.split()[-_NAME_WORDS:]
+    while len(words) > 1 and not files.holds(str(sub / " ".join(words))):
         words = words[1:]
     return " ".join(words).replace("\\", "/")
 
@@ -95,9 +130,13 @@ def _material(entry: dict[str, str], image: Image | None) -> Material:
 
 def _numbers(text: str) -> list[float]:
     try:
-        return [min(max(float(word), 0.0), 1.0) for word in text.split() if not word.startswith("-")] or [0.0]
+        return [_share(float(word)) for word in text.split() if not word.startswith("-")] or [0.0]
     except ValueError:  # spectral files and other colour spaces
         return [0.8]
+
+
+def _share(value: float) -> float:
+    return 0.8 if math.isnan(value) else min(max(value, 0.0), 1.0)
 
 
 def library_text(materials: tuple[Material, ...], images: dict[str, str]) -> str:
@@ -110,7 +149,7 @@ def library_text(materials: tuple[Material, ...], images: dict[str, str]) -> str
     return "\n".join(lines) + "\n"
 
 
-def texture_beside(folder: Path, name: str, missing: list[str]) -> Image | None:
-    """A texture that a mesh file names, from its folder; None for no name, and where it is not to be had."""
-    content = _beside(folder, name, "texture", missing) if name else None
+def texture_beside(files: NamedFiles, name: str) -> Image | None:
+    """A texture that a mesh file names; None for no name, and where it is not to be had."""
+    content = files.read(name, "texture") if name else None
     return Image(PurePosixPath(name).name, content) if content is not None else None

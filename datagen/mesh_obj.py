@@ -5,7 +5,6 @@ Lines that go on in the next are joined; names may be of any 8-bit encoding. Fre
 """
 
 import re
-import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.mesh_materials import LibraryFiles, read_library
-from datagen.mesh_surface import Encoded, Surface, shared_normals
+from datagen.mesh_surface import Encoded, Surface, numbers, shared_normals
 
 _PATTERNS = {
     (0,): re.compile(rb"\s*f(?:\s+-?\d+)+\s*"),
@@ -201,13 +200,7 @@ def _words(line: bytes) -> list[bytes]:
 
 def _as_numbers(rows: list[list[bytes]], columns: int) -> NDArray[np.float64]:
     padded = [row if len(row) == columns else [*row, *[b"0"] * (columns - len(row))] for row in rows]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns where it stops at what is no number
-        try:
-            numbers = np.fromstring(b" ".join(b" ".join(row) for row in padded), dtype=np.float64, sep=" ")
-        except DeprecationWarning as error:
-            raise ValueError(str(error)) from error
-    return numbers.reshape(len(rows), columns)
+    return numbers([word for row in padded for word in row]).reshape(len(rows), columns)
 
 
 def _is_numbers(row: list[bytes], needed: int) -> bool:

@@ -54,10 +54,16 @@ def _images(materials: tuple[Material, ...], stem: str) -> dict[str, tuple[str, 
     found = {}
     for material in materials:
         if material.image:
-            suffix = _SUFFIXES.get(material.image.mime or "", Path(material.image.name).suffix)
+            suffix = _SUFFIXES.get(material.image.mime or "", _plain_suffix(material.image.name))
             file = name_of.setdefault(material.image.content, f"{one_word(stem)}-{len(name_of)}{suffix}")
             found[material.name] = (file, material.image)
     return found
+
+
+def _plain_suffix(name: str) -> str:
+    """The ending of a file's name; none where it could be anything but that, as in a name that somebody else chose."""
+    suffix = Path(name).suffix
+    return suffix if re.fullmatch(r"\.\w{1,8}", suffix, re.ASCII) else ""
 
 
 def _vertex_lines(vertices: NDArray[np.float64], colours: NDArray[np.uint8] | None) -> Iterator[str]:

@@ -1,15 +1,18 @@
 """OFF and STL files: the formats of shapes alone."""
 
+import io
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh_surface import Encoded, Surface, numbered, shared_normals, unit
+from datagen.mesh_surface import Encoded, Surface, numbered, numbers, shared_normals, unit
 
 _STL_HEADER = 80
+_ROWS_AT_ONCE = 2**16
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -39,7 +42,7 @@ class OffContent:
         if any(len(row) < 3 for row in rows):
             raise ValueError("a vertex has fewer than three coordinates")
         self._rows = rows
-        self.vertices = np.array([row[:3] for row in rows], "S").reshape(-1, 3).astype(np.float64)
+        self.vertices = numbers([word for row in rows for word in row[:3]]).reshape(-1, 3)
         listed = [self._words(self._first + self._count + number) for number in range(faces)]
         sizes = [int(row[0]) for row in listed]
         if any(len(row) <= size or size < 0 for row, size in zip(listed, sizes, strict=True)):
@@ -82,7 +85,7 @@ def _colours(rows: list[list[bytes]]) -> NDArray[np.uint8] | None:
     lengths = {len(row) for row in rows}
     if lengths not in ({3}, {4}):
         return None
-    values = np.array(rows, "S").astype(np.float64)
+    values = numbers([word for row in rows for word in row]).reshape(len(rows), -1)
     if any(b"." in word for row in rows for word in row):
         values = values * 255
     opaque = np.full((len(rows), 4 - values.shape[1]), 255.0)
@@ -153,12 +156,18 @@ def is_binary_stl(beginning: bytes, size: int) -> bool:
 
 
 def _text_corners(content: bytes) -> NDArray[np.float64]:
-    rows = [line.split() for line in content.splitlines() if b"vertex" in line]
-    if len(rows) % 3 or any(len(row) != 4 for row in rows):
-        raise ValueError("a facet has no three corners of three numbers")
     if b"endsolid" not in content:
         raise ValueError("it ends before its solid does")
-    return np.array([row[1:] for row in rows] or np.empty((0, 3)), "S").astype(np.float64).reshape(-1, 3)
+    lines = io.BytesIO(content if b"\n" in content else content.replace(b"\r", b"\n"))
+    rows = (line.split() for line in lines if b"vertex" in line)
+    parts = [np.empty((0, 3))]
+    while some := list(islice(rows, _ROWS_AT_ONCE)):  # seven lines a triangle would take gigabytes at once
+        if any(len(row) != 4 for row in some):
+            raise ValueError("a facet has a corner without three numbers")
+        parts.append(numbers([word for row in some for word in row[1:]]).reshape(-1, 3))
+    if sum(map(len, parts)) % 3:
+        raise ValueError("a facet has no three corners")
+    return np.concatenate(parts)
 
 
 def _flat_normals(at: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh_materials import texture_beside
+from datagen.mesh_materials import NamedFiles, texture_beside
 from datagen.mesh_ply_layout import ORDERS, Table, read_header, read_tables
 from datagen.mesh_surface import Encoded, Image, Material, Surface, numbered, shared_normals
 
@@ -125,17 +125,20 @@ class PlyContent:
 
     def companions(self) -> Encoded:
         """The texture that a comment names (``TextureFile``, as MeshLab writes it)."""
-        missing: list[str] = []
-        image = texture_beside(self._path.parent, self._texture_name, missing)
-        return Encoded(b"", {self._texture_name: image.content} if image else {}, missing)
+        texture_beside(self._files, self._texture_name)
+        return Encoded(b"", self._files.contents, list(dict.fromkeys(self._files.missing)))
 
     @property
     def _texture_name(self) -> str:
         return next((line.partition(" ")[2] for line in self._header.comments if line.startswith("TextureFile ")), "")
 
     @cached_property
+    def _files(self) -> NamedFiles:
+        return NamedFiles(self._path.parent)
+
+    @cached_property
     def _texture(self) -> Image | None:
-        return texture_beside(self._path.parent, self._texture_name, [])
+        return texture_beside(self._files, self._texture_name)
 
 
 def _known(corners: NDArray[np.int64], count: int) -> bool:

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.mesh_surface import numbers
+
 _KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -63,6 +65,10 @@ def read_header(content: bytes) -> Header:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
             elements[-1][2].append(_property(words))
+    if any(count < 0 for _, count, _ in elements):
+        raise ValueError("an element has a count below 0")
+    if len({name for name, *_ in elements}) < len(elements):
+        raise ValueError("two elements have one name")
     if form not in ORDERS:
         raise ValueError(f"its format is {form!r}, none of {', '.join(ORDERS)}")
     after = content.find(b"\n", end) + 1 or content.find(b"\r", end) + 1
@@ -109,7 +115,9 @@ def _text_table(element: Element, rows: list[bytes], at: int) -> Table:
     if any(each.counted for each in element.properties):
         return _text_lists(element, words, at)
     columns = len(element.properties)
-    values = np.array([each[:columns] for each in words], dtype="S").astype(np.float64).reshape(-1, columns)
+    if any(len(row) < columns for row in words):
+        raise ValueError(f"a row of {element.name!r} has fewer than {columns} numbers")
+    values = numbers([word for row in words for word in row[:columns]]).reshape(-1, columns)
     return Table({each.name: values[:, number] for number, each in enumerate(element.properties)}, {}, at, end)
 
 
@@ -128,7 +136,7 @@ def _text_lists(element: Element, rows: list[list[bytes]], at: int) -> Table:
 
 def _floats(values: list[list[bytes]]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     flat = [word for each in values for word in each]
-    return np.array(flat or [b"0"], "S").astype(np.float64)[: len(flat)], np.array([len(v) for v in values], np.int64)
+    return numbers(flat), np.array([len(v) for v in values], np.int64)
 
 
 def _table(element: Element, found: dict[str, tuple[NDArray[Any], NDArray[np.int64]]], at: int, end: int) -> Table:
@@ -181,6 +189,8 @@ def _lists(content: bytes, element: Element, order: str, at: int) -> Table:
             size = 1
             if each.counted:
                 size = int(np.frombuffer(content, counter, 1, place)[0])
+                if size < 0:  # NumPy takes it for: all that is left
+                    raise ValueError(f"a list of {element.name!r} has {size} values")
                 place += counter.itemsize
             found[each.name].append(np.frombuffer(content, kind, size, place))
             place += size * kind.itemsize

@@ -4,6 +4,8 @@ A reader makes a :class:`Surface`, and a file of another format is made from it.
 not used for writing: there the file itself is written again with other positions.
 """
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -158,6 +160,22 @@ def component_count(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> 
             label = label[label]
         if np.array_equal(before, label):
             return len(np.unique(label[places]))
+
+
+def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
+    """The numbers [word] that words of a text stand for; ValueError where one stands for none.
+
+    An array of the words themselves would be as wide as the longest of them.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # NumPy only warns where it stops at what is no number
+        try:
+            found = np.fromstring(b" ".join(words), np.float64, sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(str(error)) from error
+    if len(found) != len(words):
+        raise ValueError(f"{len(words):,} words are {len(found):,} numbers")
+    return found
 
 
 def linear(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, array_header, reason
+from datagen.archives import FAULTS, LARGEST, array_header, member_bytes, opened, reason
 from datagen.errors import BodyError
 from datagen.mesh import write_atomically
 from datagen.recorded_arrays import array_of, require_size
@@ -65,6 +65,8 @@ def read_arrays(
 
 
 def _read_pickle(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    if path.stat().st_size > 2 * LARGEST:
+        raise BodyError(f"{path} has more bytes than any body model; download it again")
     with open(path, "rb") as file:
         content = unpickle(file, name=str(path))
     if not isinstance(content, dict):
@@ -74,9 +76,11 @@ def _read_pickle(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 
 def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            members = set(archive.namelist())
-            return {key: _read_member(archive, key, path) for key in keys if f"{key}.npy" in members}
+        with opened(path) as archive:
+            there = set(archive.namelist())
+            members = [archive.getinfo(f"{key}.npy") for key in keys if f"{key}.npy" in there]
+            require_size(sum(member.file_size for member in members), name=str(path))
+            return {key: _read_member(archive, key, path) for key in keys if f"{key}.npy" in there}
     except FAULTS as error:
         raise BodyError(f"{path} is damaged ({reason(error)}); copy or download it again") from error
 
@@ -84,7 +88,7 @@ def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
     """One array; one of Python objects, as np.savez makes of a sparse matrix, goes through our own unpickling."""
     require_size(archive.getinfo(f"{key}.npy").file_size, name=f"{key!r} in {path}")
-    content = io.BytesIO(archive.read(f"{key}.npy"))
+    content = io.BytesIO(member_bytes(archive, f"{key}.npy"))
     shape, kind = array_header(content)
     require_size(math.prod(shape) * kind.itemsize, name=f"{key!r} in {path}")
     if kind.hasobject:

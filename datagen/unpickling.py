@@ -11,6 +11,7 @@ indices) ever sees the file.
 """
 
 import pickle
+import pickletools
 import re
 from typing import Any, BinaryIO, ClassVar
 
@@ -31,6 +32,9 @@ _GLOBALS = re.compile(
     r"|(?P<chumpy>chumpy(?:\.\w+)*)",
     re.ASCII,
 )
+
+_MOST_STEPS = 2_000_000  # of a pickle; a body model's has some thousands
+_KEEPING = ("PUT", "BINPUT", "LONG_BINPUT")
 
 
 class Recorded:
@@ -73,6 +77,18 @@ class _RecordingUnpickler(pickle.Unpickler):
         return made
 
 
+def _require_modest(file: BinaryIO) -> None:
+    """Refuse a pickle of more steps than memory holds, or that numbers what it keeps far beyond them (ValueError).
+
+    Python takes memory for every number up to the highest: ten bytes can ask for 64 GiB.
+    """
+    start = file.tell()
+    for step, (code, argument, _) in enumerate(pickletools.genops(file)):
+        if step > _MOST_STEPS or (code.name in _KEEPING and int(argument or 0) > step):
+            raise ValueError("it would take more memory than any body model")
+    file.seek(start)
+
+
 def unpickle(file: BinaryIO, *, name: str) -> Any:
     """The content of a pickle: plain Python values, and :class:`Recorded` for everything else.
 
@@ -89,6 +105,7 @@ def unpickle(file: BinaryIO, *, name: str) -> Any:
         The pickle names a global that is not admitted, or is damaged. Nothing of it has been executed.
     """
     try:
+        _require_modest(file)
         return _RecordingUnpickler(file, name).load()
     except BodyError:
         raise

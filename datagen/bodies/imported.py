@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from datagen.assets import Asset, file_asset
 from datagen.errors import BodyError, MeshError
+from datagen.files import read_bounded
 from datagen.layouts import FoundMeshes, find_meshes
 from datagen.mesh import Mesh, load_mesh
+from datagen.mesh_limits import BYTE_LIMIT
 from datagen.poses import Poses
 from datagen.poses.files import NUMBER
 from datagen.recipe import Axis, ImportedBody
@@ -134,7 +136,7 @@ def _digest(meshes: FoundMeshes) -> str:
     for cell in meshes.cells():
         path = meshes.files[cell]
         try:
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            content = hashlib.sha256(read_bounded(path, limit=BYTE_LIMIT)).hexdigest()
         except OSError as error:
             raise BodyError(
                 f"{path} cannot be read ({error.strerror}). Mend its permissions or take it away"

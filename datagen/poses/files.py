@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, reason
+from datagen.archives import FAULTS, read_arrays, reason
 from datagen.assets import Asset, file_asset
 from datagen.errors import RecipeError
 from datagen.mesh import write_atomically
@@ -20,6 +20,8 @@ NUMBER = "number"
 
 _LICENCE = "as the file's owner states"
 _LARGEST_ANGLE = 1e6  # radians; sines of numbers far beyond are not finite
+_ARRAYS = ("poses", "joints", "parents")
+_MOST_JOINTS = 10_000
 _MAKE_ONE = "datagen.poses.files.write_pose_file makes one"
 
 
@@ -111,8 +113,7 @@ def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
             f"no pose file at {str(path)!r}. Name it: --set data.poses.distribution.path=FILE.npz; {_MAKE_ONE}"
         )
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+        return read_arrays(path, _ARRAYS)
     except FAULTS as error:
         raise RecipeError(f"{path} is no .npz file of plain arrays ({reason(error)}). {_MAKE_ONE}") from error
 
@@ -138,6 +139,8 @@ def _names(path: str | Path, joints: NDArray[np.generic]) -> tuple[str, ...]:
         raise RecipeError(
             f"{path}: `joints` has shape {joints.shape} and type {joints.dtype}; it must be names [joint]. {_MAKE_ONE}"
         )
+    if joints.size > _MOST_JOINTS:
+        raise RecipeError(f"{path}: `joints` has {joints.size:,} names, at most {_MOST_JOINTS:,} are read. {_MAKE_ONE}")
     return tuple(str(joint) for joint in np.atleast_1d(joints))
 
 

@@ -1,5 +1,6 @@
 """The motion files of AMASS (Mahmood et al. 2019): finding them, and reading their frames."""
 
+import io
 import math
 import zipfile
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, array_header, reason
+from datagen.archives import FAULTS, HEADER, LARGEST, array_header, opened, read_arrays, reason
 from datagen.errors import RecipeError
 
 JOINTS_OF_WIDTH = {66: 22, 72: 24, 156: 22, 165: 22}
@@ -61,7 +62,7 @@ def find_motions(path: str) -> list[Motion]:
 
 def _motion(path: Path, name: str) -> Motion | None:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with opened(path) as archive:
             used = _used(archive)
             headers = [_header(archive, each) for each in used]
     except FAULTS as error:
@@ -80,8 +81,10 @@ def _used(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Header:
+    if member.file_size > LARGEST:
+        raise ValueError(f"{member.filename} would take {member.file_size:,} bytes")
     with archive.open(member) as content:
-        shape, kind = array_header(content)
+        shape, kind = array_header(io.BytesIO(content.read(HEADER)))
     if math.prod(shape) * kind.itemsize > member.file_size:
         raise ValueError(f"{member.filename} is shorter than its shape {shape}")
     return shape, kind
@@ -109,9 +112,8 @@ def read_frames(motion: Motion) -> NDArray[np.float64]:
     """All frames [frame, 66 or 72] of a motion in radians, without what is not SMPL's."""
     path = motion.path
     try:
-        with np.load(path, allow_pickle=False) as file:
-            parts = [file["poses"]] if "poses" in file else [file[name.removesuffix(".npy")] for name in _SPLIT_NAMES]
-            frames = np.concatenate(parts, axis=-1).astype(np.float64)
+        arrays = read_arrays(path, ("poses",)) or read_arrays(path, tuple(n.removesuffix(".npy") for n in _SPLIT_NAMES))
+        frames = np.concatenate(list(arrays.values()), axis=-1).astype(np.float64)
     except FAULTS as error:
         raise RecipeError(
             f"{path} cannot be read as a motion ({reason(error)}). Fetch it again or take it away"

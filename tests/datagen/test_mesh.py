@@ -45,7 +45,7 @@ def test_files_keep_vertices_and_their_order(tmp_path: Path, suffix: str) -> Non
 @pytest.mark.parametrize(
     "content, message",
     [
-        ("", "no triangles"),
+        ("", r"is empty \(0 bytes\)"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
         ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite, the first is number 1"),
         ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),

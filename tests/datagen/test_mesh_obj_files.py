@@ -154,7 +154,8 @@ def test_materials_in_a_folder_below_and_those_that_are_not_there(tmp_path: Path
     read = read_mesh_file(path)
     notes = write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj")
     assert (tmp_path / "other" / "m" / "skin of me.png").read_bytes() == PNG
-    assert len(notes) == 2 and "../up.mtl lies outside" in notes[0] and "gone.mtl is not beside" in notes[1]
+    assert len(notes) == 2 and "gone.mtl is not beside" in notes[1]
+    assert "../up.mtl was not copied: it lies outside of the mesh's folder" in notes[0]
 
 
 @pytest.mark.parametrize(
