@@ -81,10 +81,13 @@ def has_record(folder: Path) -> bool:
     return read_record(folder) is not None
 
 
+_SURROGATE = re.compile("[\ud800-\udfff]")  # of a path that is not UTF-8, which a record must be: spelled out
+
+
 def write_record(folder: Path, record: Record) -> None:
     """Write a record; it appears whole or not at all."""
     text = json.dumps(asdict(record), indent=1, ensure_ascii=False)
-    write_atomically(folder / FILE, text.encode(errors="replace"))  # a path need not be UTF-8, a record must be
+    write_atomically(folder / FILE, _SURROGATE.sub(lambda half: f"\\\\u{ord(half[0]):x}", text).encode())
 
 
 def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, parameters: dict[str, str]) -> Record:

@@ -205,7 +205,7 @@ class _Publication:
 
         about = self.record.dataset or {}
         source = CodeDatasetSource(tags={key: printable(value) for key, value in about.items()})
-        name, digest = printable(about["name"])[:_LONGEST_NAME], about["manifest_sha256"][:36]
+        name, digest = printable(about.get("name", "?"))[:_LONGEST_NAME], about.get("manifest_sha256", "?")[:36]
         dataset = MetaDataset(source, name=name, digest=digest)
         context = InputTag("mlflow.data.context", self.record.kind)
         self.client.log_inputs(self.sent["run"], [DatasetInput(dataset._to_mlflow_entity(), [context])])

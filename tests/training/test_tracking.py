@@ -347,9 +347,22 @@ def test_summary_metrics_sent_twice_are_one_point_and_a_later_value_wins(root: P
     assert runs_of(server)["train"].data.metrics["final"] == 0.25
 
 
-def test_what_the_server_refuses_of_one_record_does_not_keep_back_the_others(root: Path, server: Server) -> None:
-    update_record(root, metrics={"pmd": "no number"})
-    with pytest.raises(TrackingError, match="no number"):
+def test_what_the_server_refuses_of_one_record_does_not_keep_back_the_others(
+    root: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mlflow.exceptions import MlflowException
+    from mlflow.protos.databricks_pb2 import INVALID_PARAMETER_VALUE
+
+    real = mlflow.MlflowClient.log_batch
+
+    def choosy(*arguments: Any, metrics: Any = (), **keywords: Any) -> Any:
+        if any(point.key == "refused" for point in metrics):
+            raise MlflowException("no such metric", error_code=INVALID_PARAMETER_VALUE)
+        return real(*arguments, metrics=metrics, **keywords)
+
+    monkeypatch.setattr(mlflow.MlflowClient, "log_batch", choosy)
+    update_record(root, metrics={"refused": 1.0})
+    with pytest.raises(TrackingError, match="no such metric"):
         publish(root, server)
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
 

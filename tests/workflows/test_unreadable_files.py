@@ -3,7 +3,6 @@
 import json
 import os
 import stat
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from training.report import NAMES
 from workflows import full, pipeline
 from workflows.cli import main
 from workflows.recipe import WorkflowRecipe
+from workflows.tasks import TaskRunner
 
 FOLDERS = {"workflow": ".", "generate": "generate", "train": "run", "evaluate": "run/evaluation"}
 GARBAGE = [b"", b"null", b'{"name": "x", "colour": "red"}', b"[" * 5000]
@@ -45,7 +45,6 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     for name in ("generate", "train", "evaluate"):
         monkeypatch.setattr(full, f"{name}_stage", stage(name))
-    monkeypatch.setattr(full, "ray_cluster", nullcontext)
     monkeypatch.setattr(full, "workflow_report", report)
     monkeypatch.setattr(full, "is_complete", lambda *_: True)
     monkeypatch.setattr(full, "is_trained", lambda *_: True)
@@ -58,17 +57,17 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_an_unreadable_record_is_made_again_by_the_same_command(
     tmp_path: Path, without_work: list[str], kind: str, content: bytes
 ) -> None:
-    full.run_workflow(WorkflowRecipe(), tmp_path)
+    full.run_workflow(WorkflowRecipe(), tmp_path, TaskRunner(local=True))
     before = {name: read_record(tmp_path / folder) for name, folder in FOLDERS.items()}
     path = tmp_path / FOLDERS[kind] / "record.json"
     path.write_bytes(content)
     without_work.clear()
-    full.run_workflow(WorkflowRecipe(), tmp_path)
+    full.run_workflow(WorkflowRecipe(), tmp_path, TaskRunner(local=True))
     assert without_work == (["evaluate", "report"] if kind in ("workflow", "evaluate") else [kind])
     after = {name: read_record(tmp_path / folder) for name, folder in FOLDERS.items()}
     assert _content(after[kind]) == _content(before[kind]) and path.with_name("record.json.unreadable").exists()
     without_work.clear()
-    full.run_workflow(WorkflowRecipe(), tmp_path)
+    full.run_workflow(WorkflowRecipe(), tmp_path, TaskRunner(local=True))
     assert not without_work, "all is well again"
 
 
@@ -123,7 +122,9 @@ def test_a_run_without_a_readable_record_is_one_line(tmp_path: Path, capsys: pyt
 def test_a_run_has_the_permissions_of_the_umask(tmp_path: Path, dataset: str) -> None:
     before = os.umask(0o077)
     try:
-        pipeline.train_stage(tiny_training(steps=4), dataset, tmp_path / "run", parent=None)
+        pipeline.train_stage(
+            tiny_training(steps=4), dataset, tmp_path / "run", parent=None, tasks=TaskRunner(local=True)
+        )
     finally:
         os.umask(before)
     for path in (tmp_path / "run").rglob("*"):
