@@ -140,6 +140,7 @@ def own_ray() -> Iterator[None]:
             raise
         raise ClusterError(watch.message) from error
     finally:
+        watch.end_kin()
         _end_processes()
 
 
@@ -188,14 +189,22 @@ class _Watch:
                 return
 
     def _end_block(self, stop: threading.Event) -> None:
-        """Interrupt the block; end the process where that is not heeded: a call to a dead server may wait for ever."""
-        _kill([*self._kin, *_family()])  # found first: those of a dead parent are nobody's children
+        """Interrupt the block; end the process where that is not heeded: a call to a dead server may wait for ever.
+
+        What is left of Ray lives until then: its client library ends the process at once when the raylet goes.
+        """
         main = threading.main_thread().ident
         assert main is not None
+        self._kin += _family()  # of now: children of a parent that dies are nobody's
         signal.pthread_kill(main, signal.SIGUSR1)
         if not stop.wait(_LEAVE_SECONDS):
             print(f"error: {self.message}", file=sys.stderr, flush=True)
+            self.end_kin()
             os._exit(ClusterError.exit_status)
+
+    def end_kin(self) -> None:
+        """Kill all that belonged to this Ray."""
+        _kill(self._kin)
 
 
 def _alive(process: psutil.Process) -> bool:
