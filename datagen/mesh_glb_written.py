@@ -21,7 +21,8 @@ from datagen.mesh import atomic_file
 from datagen.mesh_surface import Surface, shared_normals
 
 FRAME_LIMIT = 2_000
-_LARGEST = 2**32 - 2**16  # bytes of a GLB file, which counts them in 32 bits
+LARGEST = 2**32 - 2**16
+"""Bytes of a GLB file, which counts them in 32 bits."""
 Json = dict[str, Any]
 _KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 9: "MAT3", 16: "MAT4"}
@@ -97,6 +98,11 @@ class Draft:
     group: NDArray[np.int64] | None
     to_local: NDArray[np.float64]
 
+    @property
+    def frame_bytes(self) -> int:
+        """What a frame of an animation takes: positions, and normals where there are any, in four bytes a number."""
+        return 12 * len(self.of) * (1 if self.group is None else 2)
+
     def arrays(self, vertices: NDArray[np.float64]) -> list[list[NDArray[np.float32]]]:
         """Positions, and normals where there are any, of each block, from the mesh's vertices [n, 3] in world space."""
         local = vertices @ self.to_local[:3, :3].T + self.to_local[:3, 3]
@@ -137,7 +143,7 @@ class Draft:
             if targets:
                 self._animate(len(targets), targets, spool.tell(), frames_per_second, interpolation)
             size = parts.length + spool.tell()
-            if size > _LARGEST:
+            if size > LARGEST:
                 raise MeshError(
                     f"{out}: {len(targets) + 1} frames need {size:,} bytes, a GLB file holds 4 GiB: use fewer"
                 )

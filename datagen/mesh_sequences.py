@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from datagen.errors import MeshError
 from datagen.mesh import FORMATS
 from datagen.mesh_files import MeshFile, check_writable, draft_of, usable
+from datagen.mesh_glb_written import FRAME_LIMIT, LARGEST
 
 INTERPOLATIONS = ("LINEAR", "STEP")
 
@@ -71,6 +72,21 @@ def _series(path: Path) -> list[Path]:
 def _natural(path: Path) -> tuple[list[tuple[int, int | str]], str]:
     parts = re.split(r"(\d+)", path.name)
     return [(1, int(part)) if part.isdigit() else (0, part.lower()) for part in parts if part], path.name
+
+
+def require_animation(original: MeshFile, frames: int) -> None:
+    """Refuse so many frames of a mesh as one animation, before any is made.
+
+    Raises
+    ------
+    MeshError
+        They are more than ``FRAME_LIMIT``, or than 4 GiB.
+    """
+    if frames > FRAME_LIMIT:
+        raise MeshError(f"{frames:,} frames are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere")
+    size = frames * draft_of(original).frame_bytes
+    if size > LARGEST:
+        raise MeshError(f"{frames:,} frames of {original.path} need {size:,} bytes, an animated GLB holds 4 GiB")
 
 
 def write_animation(

@@ -10,6 +10,7 @@ The signature takes arrays; with ``model.unwrap_python_model()`` meshes may be n
 """
 
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -66,8 +67,13 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
     def _axes(self, source: Mesh, target: Mesh, wanted: Mapping[str, Any]) -> tuple[Axes, Axes]:
         if not wanted["align"]:
             return axes_of_both(str(wanted["up"]), str(wanted["front"]))
-        of_source, of_target = (orientation(self._transfer.self_errors, [m.vertices]).axes for m in (source, target))
-        return of_source, of_target
+        return self._found(source, "source"), self._found(target, "target")
+
+    def _found(self, mesh: Mesh, role: str) -> Axes:
+        way = orientation(self._transfer.self_errors, [mesh.vertices])
+        if not way.is_certain:
+            warnings.warn(f"how the {role} stands is not certain: it is taken as it lies", stacklevel=4)
+        return way.axes
 
 
 def _mesh(model_input: Any, role: str) -> Mesh:

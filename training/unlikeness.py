@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from datagen.errors import DsffnetError
 from datagen.mesh import Mesh, bounding_box, edges_of
-from training.alignment import Axes, Orientation, axes_as_options
+from training.alignment import POOR_ERROR, Axes, Orientation, axes_as_options
 from training.provenance import FILE, Provenance, provenance_of
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ _PROPORTIONS_BEYOND = 1.5  # times the range of training
 _STRAY_SHARE, _STRAY_TIMES = 0.01, 2.0  # so few vertices that make the box so many times larger
 _FLAT = 0.02  # shortest over longest edge of the box
 _MAIN_SHARE = 0.5  # of the vertices, in the largest connected part
-_POOR_ERROR = 0.01  # PMD of a mesh onto itself: 0.1 of half the box, in every coordinate
 _IDENTITIES_LOOKED_AT, _POSES_LOOKED_AT = 16, 64
 """Of a dataset; with 3 poses 505 of 6,800 meshes of the quickstart's own evaluation passed for ill-proportioned, with
 16 one, with 64 none."""
@@ -102,7 +101,7 @@ def _spread(count: int, wanted: int) -> NDArray[np.int64]:
 
 
 def remarks(
-    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], chosen: bool, seen: Seen | None
+    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], told: bool, seen: Seen | None
 ) -> Iterator[str]:
     """One line for everything about a mesh that its network has not met.
 
@@ -112,28 +111,36 @@ def remarks(
         As it is in its file.
     name
         What the lines call it.
-    axes, way, both, chosen
+    axes, way, both, told
         How it is taken to stand, how well it comes back in every way of standing, how source and target seem to stand,
         and whether a person said how.
     seen
         What the network saw, None where that is not known.
     """
     upright = axes.turned(mesh.vertices)
-    stands_otherwise = not chosen and way.is_unlike_training and way.axes != axes
-    yield from _about_standing(name, axes, way, axes_as_options(*both) if stands_otherwise else None)
+    fits = way.error(axes) <= POOR_ERROR if told else way.fits(axes)
+    if not fits:
+        yield _about_standing(name, axes, way, None if told else both)
     yield from _about_parts(name, mesh)
-    yield from _about_box(name, upright, None if stands_otherwise else seen)
+    yield from _about_box(name, upright, seen if fits else None)
     yield from _about_count(name, len(upright), seen)
 
 
-def _about_standing(name: str, axes: Axes, way: Orientation, mended_by: str | None) -> Iterator[str]:
-    if mended_by is not None:
-        yield f"{name} seems to stand {way.axes}, the training data {axes}: add --align, or {mended_by}"
-    elif way.error(axes) > _POOR_ERROR:
-        yield (
+def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes] | None) -> str:
+    """What speaks against a mesh that stands by ``axes``; how it stands is said only where it is certain."""
+    if both and way.is_certain:
+        return f"{name} seems to stand {way.axes}, the training data {axes}: add --align, or {axes_as_options(*both)}"
+    if way.error(axes) > POOR_ERROR:
+        return (
             f"{name} comes back from the network as another shape (PMD {way.error(axes):.3f} onto itself): it is "
-            "unlike the bodies of training, or stands otherwise; look at --picture, or try --align"
+            f"unlike the bodies of training, or does not stand {axes}, or is turned about the vertical. The result "
+            "may be poor; look at --picture"
         )
+    how = "may be turned about the vertical" if way.is_between else f"may not stand {axes}"
+    return (
+        f"{name} {how}: it comes back from the network better when it is turned otherwise, but no way is certain. "
+        "The result may be poor; look at --picture"
+    )
 
 
 def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:

@@ -1,22 +1,23 @@
 """A transfer at work: how the meshes stand, what to warn of, the frames, and what a person looks at."""
 
+import contextlib
 import os
+import shutil
 import sys
-import tempfile
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import storage_errors
-from datagen.mesh import Mesh
-from datagen.mesh_files import MeshFile, write_posed
-from datagen.mesh_glb_written import FRAME_LIMIT
-from datagen.mesh_sequences import write_animation
+from datagen.errors import MeshError, storage_errors
+from datagen.mesh import Mesh, write_atomically
+from datagen.mesh_files import MeshFile, posed_bytes, write_posed
+from datagen.mesh_sequences import require_animation, write_animation
 from datagen.printable import printable
 from training.alignment import UPRIGHT, Axes, orientation
 from training.refinement import DEFAULT_WEIGHT
@@ -51,11 +52,13 @@ class TransferWork:
         errors = self.transfer.self_errors
         ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
         self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
-        chosen, seen = self.job.is_told or self.job.axes is None, seen_by(weights)
+        seen = seen_by(weights)
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
         for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
             both = ways[0].axes, ways[1].axes
-            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, chosen=chosen, seen=seen):
+            if self.job.axes is None and not way.is_certain:
+                warn(f"--align leaves {path} as it is: how it stands is not certain")
+            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, told=self.job.is_told, seen=seen):
                 warn(line)
 
     def run(self) -> str:
@@ -82,11 +85,14 @@ class TransferWork:
         job = self.job
         about = f"{job.out}: {len(job.sources)} frames of {job.target}"
         if job.is_file:
+            require_animation(self.target, len(job.sources))
             self._animate(self._posed(), job.animation)
             return about
         with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
-            if len(job.sources) > FRAME_LIMIT:
-                warn(f"no {job.animation.name}: it holds {FRAME_LIMIT:,} frames at most, and these are more")
+            try:
+                require_animation(self.target, len(job.sources))
+            except MeshError as error:
+                warn(f"no {job.animation.name}: {error}")
                 deque(self._saved(folder), maxlen=0)
                 return about
             self._animate(self._saved(folder), folder / job.animation.name)
@@ -99,14 +105,16 @@ class TransferWork:
     def _saved(self, folder: Path) -> Iterator[Mesh]:
         """The frames, each written to its file as it passes."""
         for number, posed in enumerate(self._posed()):
-            name = self.job.frame_file(self.job.sources[number]).name
-            self._write_posed(posed, folder / name, quiet=number > 0)
+            place = folder / self.job.frame_file(self.job.sources[number]).name
+            if number:  # what lies beside the first lies beside all
+                write_atomically(place, posed_bytes(self.target, posed.vertices, place.suffix))
+            else:
+                self._write_posed(posed, place)
             yield posed
 
-    def _write_posed(self, posed: Mesh, out: Path, *, quiet: bool = False) -> None:
+    def _write_posed(self, posed: Mesh, out: Path) -> None:
         for lost in write_posed(self.target, posed.vertices, out):
-            if not quiet:
-                warn(lost)
+            warn(lost)
 
     def _posed(self) -> Iterator[Mesh]:
         """The output of every frame; those that the picture shows are kept."""
@@ -160,14 +168,39 @@ def _move(path: Path, place: Path, *, is_own: bool) -> None:
 
 @contextmanager
 def _appearing_whole(out: Path, *, own: set[str]) -> Iterator[Path]:
-    """A folder beside ``out`` to write into, whose files move there only if the block succeeds.
+    """A folder beside ``out`` to write into, whose files move there only if the block succeeds; else they stay in it.
 
     Those of ``own`` take the place of an earlier run's; materials and textures leave other files of their name alone.
     """
     with storage_errors(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
-            yield Path(folder)
-            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+        folder = _new_folder(out)
+        try:
+            yield folder
+            for path in sorted(path for path in folder.rglob("*") if path.is_file()):
                 name = path.relative_to(folder)
                 _move(path, out / name, is_own=str(name) in own)
+        except KeyboardInterrupt as interrupt:
+            raise KeyboardInterrupt(f"{_finished_in(folder, own)}; the same command begins again") from interrupt
+        except BaseException:
+            warn(_finished_in(folder, own))
+            raise
+        shutil.rmtree(folder)
+
+
+def _new_folder(out: Path) -> Path:
+    """``out``.unfinished, numbered where an earlier run left one."""
+    for number in count(1):
+        folder = out.with_name(f"{out.name}.unfinished{'' if number == 1 else f'-{number}'}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            return folder
+    raise AssertionError("there are numbers without end")
+
+
+def _finished_in(folder: Path, own: set[str]) -> str:
+    """How many frames are finished, and where a person finds them; a folder without any is removed."""
+    finished = sum(path.name in own for path in folder.iterdir())
+    if finished:
+        return f"the first {finished:,} frames are finished, in {folder}"
+    shutil.rmtree(folder, ignore_errors=True)
+    return "no frame is finished"

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from datagen import mesh_sequences
 from datagen.errors import DsffnetError, MeshError, RecipeError, StorageError
 from datagen.generate import generate
 from datagen.mesh import Mesh, load_mesh, save_mesh
+from datagen.mesh_files import MeshFile
 from datagen.store import open_dataset
 from tests.support.commands import command, fails
 from tests.support.recipes import tiny_dataset, tiny_training
@@ -20,6 +22,8 @@ from training.checkpoint import CheckpointError
 from training.trainer import train
 from training.transfer import PoseTransfer
 from workflows import cli
+from workflows.transfer_job import TransferJob
+from workflows.transfer_work import TransferWork
 
 Transfer = Callable[..., None]
 
@@ -186,16 +190,70 @@ def test_frames_come_in_their_numbers_order(transfer: Transfer, run: Path, tmp_p
     assert np.allclose(found.vertices, expected[10].vertices, atol=1e-5)
 
 
-def test_a_broken_frame_leaves_nothing_behind(transfer: Transfer, tmp_path: Path) -> None:
-    walk = tmp_path / "walk"
+def broken_walk(folder: Path, *, broken: int) -> Path:
     for number in range(3):
-        save_mesh(load_mesh("pose.obj"), walk / f"{number}.obj")
-    (walk / "1.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        save_mesh(load_mesh("pose.obj"), folder / f"{number}.obj")
+    (folder / f"{broken}.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    return folder
+
+
+def test_of_a_broken_frame_on_what_is_finished_stays_beside_the_output(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = broken_walk(tmp_path / "walk", broken=1)
+    monkeypatch.setattr(TransferWork, "settle_axes", lambda work, weights: None)  # it looks at later frames, too
     before = files(tmp_path)
-    for out in ("walked", "walked.glb"):
+    with pytest.raises(MeshError, match=r"1\.obj"):
+        transfer(walk, "person.obj", "-o", tmp_path / "walked.glb")
+    assert files(tmp_path) == before, "an animation appears whole or not at all"
+    for unfinished in ("walked.unfinished", "walked.unfinished-2"):
         with pytest.raises(MeshError, match=r"1\.obj"):
-            transfer(walk, "person.obj", "-o", tmp_path / out)
+            transfer(walk, "person.obj", "-o", tmp_path / "walked")
+        assert f"the first 1 frames are finished, in {tmp_path / unfinished}" in capsys.readouterr().err
+        assert load_mesh(tmp_path / unfinished / "0.obj")
+        before = sorted([*before, unfinished, f"{unfinished}/0.obj"])
         assert files(tmp_path) == before
+
+
+def test_an_interruption_keeps_what_is_finished_and_breaks_nothing(
+    transfer: Transfer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames of an earlier run stay whole, and none of the new ones is among them."""
+    transfer("walk", "person.obj", "-o", tmp_path / "walked")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "walked").iterdir()}
+    read = TransferJob.read_source
+
+    def until_ctrl_c(job: TransferJob, number: int) -> MeshFile:
+        if number == 7:
+            raise KeyboardInterrupt
+        return read(job, number)
+
+    monkeypatch.setattr(TransferJob, "read_source", until_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        transfer("walk", "person.obj", "-o", tmp_path / "walked", "--refine")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "walked").iterdir()} == before
+    assert files(tmp_path / "walked.unfinished") == [f"frame_{number}.obj" for number in range(7)]
+    assert all(load_mesh(path).faces.size for path in (tmp_path / "walked.unfinished").iterdir())
+
+
+def test_a_first_frame_that_is_broken_leaves_nothing_behind(transfer: Transfer, tmp_path: Path) -> None:
+    walk = broken_walk(tmp_path / "walk", broken=0)
+    before = files(tmp_path)
+    with pytest.raises(MeshError, match=r"0\.obj"):
+        transfer(walk, "person.obj", "-o", tmp_path / "walked")
+    assert files(tmp_path) == before
+
+
+def test_more_frames_than_an_animation_holds_are_said_before_any_is_made(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mesh_sequences, "FRAME_LIMIT", 11)
+    with monkeypatch.context() as patched, pytest.raises(MeshError, match="12 frames are more than 11"):
+        patched.setattr(PoseTransfer, "sequence", None)
+        transfer("walk", "person.obj", "-o", tmp_path / "walked.glb")
+    transfer("walk", "person.obj", "-o", tmp_path / "walked")
+    assert "no animation.glb: 12 frames are more than 11" in capsys.readouterr().err
+    assert files(tmp_path / "walked") == sorted(f"frame_{number}.obj" for number in range(12))
 
 
 @pytest.mark.parametrize(
