@@ -238,6 +238,7 @@ def test_sigkill_of_ray_workers_while_generating(undisturbed: Path, tmp_path: Pa
     assert tree_hash(out / "dataset.zarr") == tree_hash(Path(local.url))
 
 
+@pytest.mark.timeout(900)  # two runs
 @pytest.mark.parametrize("server", ["gcs_server", "raylet"])
 @pytest.mark.parametrize("stage", ["generate", "train"])
 def test_sigkill_of_a_server_of_ray(stage: str, server: str, undisturbed: Path, tmp_path: Path) -> None:
