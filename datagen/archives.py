@@ -21,6 +21,8 @@ FAULTS = (
 """What zipfile and NumPy raise on archives that are damaged, encrypted, packed in unknown ways, or too large."""
 
 
+Header = tuple[tuple[int, ...], "np.dtype[Any]"]
+"""Shape and type of an array."""
 LARGEST = 2**30
 """Bytes at most of an archive, and of all arrays that are read of it; SMPL-X's arrays have a third of it."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # NumPy's; others unpack without a limit
@@ -81,20 +83,32 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         for name in names:
             if f"{name}.npy" in there:
                 left = LARGEST - sum(array.nbytes for array in found.values())
-                found[name] = _array(member_bytes(archive, f"{name}.npy", limit=left))
+                member_header(archive, f"{name}.npy")
+                content = io.BytesIO(member_bytes(archive, f"{name}.npy", limit=left))
+                found[name] = np.lib.format.read_array(content, allow_pickle=False)
     return found
 
 
-def _array(content: bytes) -> NDArray[Any]:
-    file = io.BytesIO(content)
-    shape, kind = array_header(file)
-    if math.prod(shape) * max(kind.itemsize, 1) > len(content):  # NumPy would take the memory first
-        raise ValueError(f"an array is shorter than its shape {shape}")
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
+def member_header(archive: zipfile.ZipFile, name: str) -> Header:
+    """Shape and type of the array that a member holds; no more than its beginning is unpacked.
+
+    Raises
+    ------
+    ValueError
+        It holds none, or would take more than :data:`LARGEST`, or is shorter than its shape: NumPy would take the
+        memory first.
+    """
+    member = archive.getinfo(name)
+    if member.file_size > LARGEST:
+        raise ValueError(f"{name} would take {member.file_size:,} bytes, at most {LARGEST:,} are read")
+    with archive.open(member) as content:
+        shape, kind = array_header(io.BytesIO(content.read(HEADER)))
+    if math.prod(shape) * max(kind.itemsize, 1) > member.file_size and not kind.hasobject:
+        raise ValueError(f"{name} is shorter than its shape {shape}")
+    return shape, kind
 
 
-def array_header(content: IO[bytes]) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
+def array_header(content: IO[bytes]) -> Header:
     """Shape and type of the array of an .npy file that is open at its first byte; reads no further than its header.
 
     Raises

@@ -63,8 +63,8 @@ def read_bounded(path: Path, *, limit: int) -> bytes:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        content = file.read(min(limit, size) + 1)
-    if len(content) > limit:
+        content = file.read(size + 1) if size <= limit else b""  # some files, as those of /proc, have no size
+    if max(size, len(content)) > limit:
         raise UnsafeFileError(f"{path} is longer than the {limit:,} bytes that it can have ({size:,})")
     return content
 

@@ -99,7 +99,7 @@ def load_mesh(path: str | Path) -> Mesh:
     try:
         refuse_huge(path)
         content = read_bounded(path, limit=BYTE_LIMIT)
-    except (OSError, ValueError, LookupError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
     return check_mesh(_single_geometry(path, content), name=str(path))
 

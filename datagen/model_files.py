@@ -7,7 +7,6 @@ anything in them (:mod:`datagen.unpickling`).
 """
 
 import io
-import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, LARGEST, array_header, member_bytes, opened, reason
+from datagen.archives import FAULTS, LARGEST, array_header, member_bytes, member_header, opened, reason
 from datagen.errors import BodyError
 from datagen.mesh import write_atomically
 from datagen.recorded_arrays import array_of, require_size
@@ -87,11 +86,10 @@ def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 
 def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
     """One array; one of Python objects, as np.savez makes of a sparse matrix, goes through our own unpickling."""
-    require_size(archive.getinfo(f"{key}.npy").file_size, name=f"{key!r} in {path}")
+    _, kind = member_header(archive, f"{key}.npy")
     content = io.BytesIO(member_bytes(archive, f"{key}.npy"))
-    shape, kind = array_header(content)
-    require_size(math.prod(shape) * kind.itemsize, name=f"{key!r} in {path}")
     if kind.hasobject:
+        array_header(content)  # the pickle is behind it
         return array_of(unpickle(content, name=f"{key!r} in {path}"), name=f"{key!r} in {path}")
     content.seek(0)
     return np.lib.format.read_array(content, allow_pickle=False)

@@ -10,9 +10,11 @@ Neither NumPy's own unpickling (whose dtypes can be made to lie about pointers) 
 indices) ever sees the file.
 """
 
+import os
 import pickle
 import pickletools
 import re
+import struct
 from typing import Any, BinaryIO, ClassVar
 
 from datagen.errors import BodyError
@@ -34,7 +36,16 @@ _GLOBALS = re.compile(
 )
 
 _MOST_STEPS = 2_000_000  # of a pickle; a body model's has some thousands
-_KEEPING = ("PUT", "BINPUT", "LONG_BINPUT")
+_CODES = {code.code.encode("latin1"): code for code in pickletools.opcodes}
+_KEEPING = {"BINPUT": "<B", "LONG_BINPUT": "<I"}
+_SIZES = {"FRAME": "<Q"}
+_COUNTED = {
+    pickletools.TAKEN_FROM_ARGUMENT1: "<B",
+    pickletools.TAKEN_FROM_ARGUMENT4: "<i",
+    pickletools.TAKEN_FROM_ARGUMENT4U: "<I",
+    pickletools.TAKEN_FROM_ARGUMENT8U: "<Q",
+}
+"""How arguments that begin with their own size write it."""
 
 
 class Recorded:
@@ -78,15 +89,46 @@ class _RecordingUnpickler(pickle.Unpickler):
 
 
 def _require_modest(file: BinaryIO) -> None:
-    """Refuse a pickle of more steps than memory holds, or that numbers what it keeps far beyond them (ValueError).
+    """Refuse a pickle of more steps than memory holds, or that promises more than it has (ValueError).
 
-    Python takes memory for every number up to the highest: ten bytes can ask for 64 GiB.
+    Python takes memory for sizes before it reads so many bytes, and for every number of what is kept up to the highest:
+    ten bytes can ask for 64 GiB. Arguments are passed over and not decoded, as :mod:`pickletools` would: it refuses the
+    text strings of Python 2, which hold any bytes.
     """
     start = file.tell()
-    for step, (code, argument, _) in enumerate(pickletools.genops(file)):
-        if step > _MOST_STEPS or (code.name in _KEEPING and int(argument or 0) > step):
-            raise ValueError("it would take more memory than any body model")
+    end = file.seek(0, os.SEEK_END)
     file.seek(start)
+    step, name = 0, ""
+    while name != "STOP":
+        name, kept = _pass_over(file, end)
+        if step > _MOST_STEPS or kept > step:
+            raise ValueError("it would take more memory than any body model")
+        step += 1
+    file.seek(start)
+
+
+def _pass_over(file: BinaryIO, end: int) -> tuple[str, int]:
+    """Pass over one step: its name, and the number that it keeps something by (else 0)."""
+    code = _CODES.get(file.read(1))
+    if code is None:
+        raise ValueError("it is cut off, or no pickle")
+    form = _KEEPING.get(code.name) or _SIZES.get(code.name) or (_COUNTED.get(code.arg.n) if code.arg else None)
+    if form:
+        (number,) = struct.unpack(form, file.read(struct.calcsize(form)))
+        if code.name in _KEEPING:
+            return code.name, number
+        if not 0 <= number <= end - file.tell():
+            raise ValueError(f"it is cut off: {number:,} bytes are promised")
+        if code.name not in _SIZES:
+            file.seek(number, os.SEEK_CUR)
+    elif code.arg and code.arg.n == pickletools.UP_TO_NEWLINE:
+        line = file.readline()
+        if code.name in ("GLOBAL", "INST"):
+            file.readline()
+        return code.name, int(line) if code.name == "PUT" else 0
+    elif code.arg:
+        file.seek(code.arg.n, os.SEEK_CUR)
+    return code.name, 0
 
 
 def unpickle(file: BinaryIO, *, name: str) -> Any:

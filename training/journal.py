@@ -21,7 +21,7 @@ from training.run_files import warn_once
 _Whole = Annotated[int, Field(strict=True, gt=-(2**63), lt=2**63)]
 _ROW: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, _Whole | Annotated[float, Strict()]])
 _MOST_STEPS, _LAST_SECOND = 2**53, 253_402_300_800  # the year 9999
-_LONGEST_LINE, _BLOCK = 2**20, 2**16  # bytes
+_LONGEST_LINE = 2**20  # bytes
 
 
 class Journal:
@@ -125,14 +125,12 @@ def _drop_torn_line(path: Path) -> None:
     if not path.exists():
         return
     with open_regular(resolve_within(path.parent, path.name)) as file:
-        size = start = file.seek(0, os.SEEK_END)
-        found = -1
-        while start and found < 0:
-            start = max(0, start - _BLOCK)
-            file.seek(start)
-            found = file.read(_BLOCK).rfind(b"\n")
-    if start + found + 1 < size:
-        os.truncate(path, start + found + 1)
+        whole = 0
+        while (line := file.readline(_LONGEST_LINE)).endswith(b"\n"):
+            whole += len(line)
+        size = file.seek(0, os.SEEK_END)
+    if whole < size:
+        os.truncate(path, whole)
 
 
 def coefficient_metrics(network: object) -> dict[str, float]:

@@ -23,6 +23,7 @@ from datagen.files import open_regular
 from training.run_files import fault_in
 
 _HEADER, _NAMED_AT_MOST = "dsffnet", 3
+_SHORTEST_HEADER = 2  # bytes of an empty JSON object
 _LONGEST_HEADER = 16 * 2**20  # bytes; those of our networks have some ten thousand
 _MOST_STEPS = 2**53
 
@@ -118,7 +119,7 @@ _UNREADABLE = (OSError, SafetensorError, RuntimeError, ValueError, OverflowError
 def _require_short_header(path: Path) -> None:
     with open_regular(path) as file:
         length = int.from_bytes(file.read(8), "little")
-    if length > _LONGEST_HEADER:
+    if not _SHORTEST_HEADER <= length <= _LONGEST_HEADER:
         raise ValueError(f"its header would have {length:,} bytes")
 
 

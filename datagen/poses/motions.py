@@ -1,7 +1,5 @@
 """The motion files of AMASS (Mahmood et al. 2019): finding them, and reading their frames."""
 
-import io
-import math
 import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, HEADER, LARGEST, array_header, opened, read_arrays, reason
+from datagen.archives import FAULTS, Header, member_header, opened, read_arrays, reason
 from datagen.errors import RecipeError
 
 JOINTS_OF_WIDTH = {66: 22, 72: 24, 156: 22, 165: 22}
@@ -20,9 +18,6 @@ _SPLIT_NAMES = ("root_orient.npy", "pose_body.npy")  # SMPL-X releases have thes
 _NAMES = (("poses.npy",), _SPLIT_NAMES)
 _LARGEST_ANGLE = 1e6  # radians; sines of numbers far beyond are not finite
 _NAME_IT = "Name the folder of motions: --set data.poses.distribution.path=FOLDER"
-
-Header = tuple[tuple[int, ...], "np.dtype[np.generic]"]
-"""Shape and type of an array."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ def _motion(path: Path, name: str) -> Motion | None:
     try:
         with opened(path) as archive:
             used = _used(archive)
-            headers = [_header(archive, each) for each in used]
+            headers = [member_header(archive, each.filename) for each in used]
     except FAULTS as error:
         raise RecipeError(f"{path} is no .npz file ({reason(error)}). Fetch it again or take it away") from error
     if not used:
@@ -78,16 +73,6 @@ def _used(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
     members = {member.filename: member for member in archive.infolist()}
     names = next((names for names in _NAMES if members.keys() >= set(names)), ())
     return [members[name] for name in names]
-
-
-def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Header:
-    if member.file_size > LARGEST:
-        raise ValueError(f"{member.filename} would take {member.file_size:,} bytes")
-    with archive.open(member) as content:
-        shape, kind = array_header(io.BytesIO(content.read(HEADER)))
-    if math.prod(shape) * kind.itemsize > member.file_size:
-        raise ValueError(f"{member.filename} is shorter than its shape {shape}")
-    return shape, kind
 
 
 def _frame_count(path: Path, headers: list[Header]) -> int:

@@ -70,6 +70,15 @@ def test_missing_unknown_and_unreadable_files(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.glb")
 
 
+def test_a_glb_that_says_another_type_is_one_error(tmp_path: Path) -> None:
+    save_mesh(TETRAHEDRON, tmp_path / "a.glb")
+    content = (tmp_path / "a.glb").read_bytes()
+    start, end = content.index(b'[{"attributes"'), content.index(b"}]", content.index(b'[{"attributes"')) + 2
+    (tmp_path / "a.glb").write_bytes(content[:start] + b'["x"]'.ljust(end - start) + content[end:])
+    with pytest.raises(MeshError, match="cannot be read as a GLB"):
+        load_mesh(tmp_path / "a.glb")
+
+
 def test_faces_that_index_nothing() -> None:
     with pytest.raises(MeshError, match="faces name vertex 9"):
         check_mesh(Mesh(TETRAHEDRON.vertices, np.array([[0, 1, 9]])), name="mine")

@@ -1,6 +1,7 @@
 """Files that somebody else named stay in their folder, are regular, and have a bounded size."""
 
 import os
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -48,3 +49,15 @@ def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:
             read_bounded(path, limit=10)
     with pytest.raises(FileNotFoundError):
         read_bounded(tmp_path / "nothing", limit=5)
+
+
+def test_what_is_too_long_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    os.truncate(tmp_path / "file", 2**36)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnsafeFileError, match="longer than"):
+            read_bounded(tmp_path / "file", limit=2**28)
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()

@@ -129,6 +129,15 @@ def test_weights_copied_away_from_their_checkpoint_know_themselves(tmp_path: Pat
         require_checkpoint(alone)
 
 
+def test_a_file_of_nothing_but_zeros_is_refused_by_its_header(tmp_path: Path) -> None:
+    """Before it is mapped, for which there may be no room."""
+    path = tmp_path / "mine.safetensors"
+    path.touch()
+    os.truncate(path, 2**36)
+    with pytest.raises(CheckpointError, match="header would have 0 bytes"):
+        require_checkpoint(path)
+
+
 def test_none_or_all_damaged(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     flip_bit(save(tmp_path, 1) / "weights.safetensors")

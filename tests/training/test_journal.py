@@ -75,6 +75,8 @@ def test_what_has_no_lines_is_not_read_whole(tmp_path: Path) -> None:
         file.write(b'{"step": 1, "time": 0}\n')
         file.truncate(2**40)  # a terabyte without a line's end
     assert [row["step"] for row in read_journal(path)] == [1]
+    Journal(path).close()
+    assert path.stat().st_size == len(b'{"step": 1, "time": 0}\n')
 
 
 def test_a_journal_elsewhere_is_neither_read_nor_written(tmp_path: Path) -> None:
