@@ -16,7 +16,6 @@ import torch
 from datagen.mesh import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from training import metrics
-from training.alignment import CLEARLY, orientation
 from training.placing import scale_of
 from training.refinement import Refinement
 from training.transfer import PoseTransfer
@@ -37,12 +36,6 @@ def main() -> None:
     rows = np.array([refined(transfer, dataset, triple) for triple in triples]).mean(axis=0)
     for weight, (pmd, edge, normal) in zip(WEIGHTS, rows, strict=True):
         print(f"| {weight:g} | {pmd * 1e4:.1f} | {edge:.3f} | {normal:.1f} |")
-    errors = np.array([orientation(transfer.self_errors, [dataset.vertices(t[2], t[3])]).errors for t in triples])
-    lead = errors[:, 1:].min(axis=1) / errors[:, 0]
-    print(f"alignment: upright comes back best in {(lead > 1).sum()} of {len(lead)}; the next best way")
-    print(f"  has {lead.min():.1f} times its error at least, {np.median(lead):.1f} times in the middle")
-    found = (errors[:, 1:] > CLEARLY * errors[:, :1]) & (lead > 1)[:, None]
-    print(f"  laid in the 23 other ways, {found.sum():,} of {found.size:,} are found as they lie")
 
 
 def refined(transfer: PoseTransfer, dataset: Dataset, triple: list[int]) -> list[tuple[float, float, float]]:

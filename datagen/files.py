@@ -34,6 +34,20 @@ def resolve_within(folder: Path, name: str) -> Path:
     return path
 
 
+def refuse_links_out(folder: Path) -> None:
+    """Raise if something directly in a folder, which need not exist, is a link that leads out of it.
+
+    Raises
+    ------
+    UnsafeFileError
+        With the first such link.
+    """
+    if folder.is_dir():
+        for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+            if entry.is_symlink():
+                resolve_within(folder, entry.name)
+
+
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file for reading, without waiting for anything.
 

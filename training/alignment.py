@@ -30,9 +30,11 @@ _PROBED_VERTICES = 256  # of a mesh: so many tell the 24 ways apart as well as 5
 POOR_ERROR = 0.01
 """PMD of a mesh onto itself, at most, where the network knows it and it stands right: 0.1 of half the box, in every
 coordinate."""
-_CLEARLY = 1.5  # so many times better than every other way comes back the one that is certain
-_NEARLY = 1.3  # so many times the error of the best way may have one that is as good
-_TURN = 20.0  # degrees about the vertical that a mesh is turned by, to see whether it stands between the axes
+_CLEARLY = 1.5  # so many times the error of a way that is certain has every other at least
+_NEARLY = 1.3  # so many times the error of the best way has one at most that is as good
+TURN = 30.0
+"""Degrees about the vertical that a mesh is turned by, to see whether it stands between the axes."""
+_ALONG, _BETWEEN = 1.2, 0.7  # times the error of the best way, so much at least and at most has the mesh turned so
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class Orientation:
     errors
         In each of EVERY_AXES, [24].
     turned
-        In the best of them and turned further about the vertical, by 20 degrees to either side, [2].
+        In the best of them and turned further about the vertical, by 30 degrees to either side, [2].
     """
 
     errors: NDArray[np.float64]
@@ -133,14 +135,14 @@ class Orientation:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the mesh comes back well in one way, clearly better than in any other, and not better between two."""
+        """Whether the mesh comes back well in one way, clearly better than in any other and than turned from it."""
         least, next_best = np.sort(self.errors)[:2]
-        return bool(least <= POOR_ERROR and next_best >= _CLEARLY * least) and not self.is_between
+        return bool(least <= POOR_ERROR and next_best >= _CLEARLY * least and self.turned.min() >= _ALONG * least)
 
     @property
     def is_between(self) -> bool:
-        """Whether the mesh comes back better when it is turned a little further about the vertical."""
-        return bool(self.turned.min() < self.errors.min())
+        """Whether the mesh comes back clearly better when it is turned from its best way about the vertical."""
+        return bool(self.turned.min() <= _BETWEEN * self.errors.min())
 
     def fits(self, axes: Axes) -> bool:
         """Whether nothing speaks against a mesh that stands by ``axes``."""
@@ -178,7 +180,7 @@ def _turned_ways(mesh: Floats) -> Floats:
 
 def _turned_a_little(mesh: Floats) -> Floats:
     """The mesh, Y up, turned about the vertical to either side."""
-    sine, cosine = np.sin(np.radians(_TURN)), np.cos(np.radians(_TURN))
+    sine, cosine = np.sin(np.radians(TURN)), np.cos(np.radians(TURN))
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     return np.stack([_probe(mesh @ turn), _probe(mesh @ turn.T)])
 

@@ -29,6 +29,7 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        resolve_within(path.parent, path.name)  # a link to what is not there yet, too
         _drop_torn_line(path)
         self._path, self._last = path, max((row["step"] for _, row in journal_from(path, 0)), default=-1)
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - open for the whole run

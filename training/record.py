@@ -32,10 +32,14 @@ MODEL, ALIAS = "dsffnet", "latest-trained"
 
 @dataclass(frozen=True)
 class Server:
-    """Where to mirror to: MLflow tracking URI, and where artifacts go if this creates the experiment (a local path)."""
+    """Where to mirror to: MLflow tracking URI, and where artifacts go if this creates the experiment (a local path).
+
+    ``own``: nobody named the server; its store came with the folder whose records are sent, and may be a stranger's.
+    """
 
     uri: str
     artifacts: Path | None = None
+    own: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,10 @@ def parent_of(folder: Path, record: Record) -> Path | None:
     """The folder of a record's parent: one that holds the record's own; None where it names none or another."""
     steps = PurePosixPath(record.parent or "").parts
     above = Path(os.path.realpath(folder)).parents
-    return above[len(steps) - 1] if set(steps) == {".."} and len(steps) <= len(above) else None
+    if set(steps) != {".."} or len(steps) > len(above):
+        return None
+    between = above[: len(steps) - 1]  # trials/NAME and RUN/evaluation lie so; a stranger's run in a folder of ours not
+    return above[len(steps) - 1] if all(each.name == "trials" or (each / FILE).is_file() for each in between) else None
 
 
 def find_records(root: Path) -> list[Path]:

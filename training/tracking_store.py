@@ -13,11 +13,13 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
+from urllib.request import url2pathname
 
 from filelock import FileLock
 
-from datagen.errors import RecipeError, StorageError
+from datagen.errors import RecipeError, StorageError, UnsafeFileError
+from datagen.files import resolve_within
 from training.record import EXPERIMENT, Server
 
 log = logging.getLogger(__name__)
@@ -33,7 +35,7 @@ _PLACES = {
 """Table -> its column of absolute places."""
 
 
-def sqlite_server(database: Path) -> Server:
+def sqlite_server(database: Path, *, own: bool = False) -> Server:
     """Return the server of a SQLite file, with its artifacts beside it.
 
     Raises
@@ -47,7 +49,7 @@ def sqlite_server(database: Path) -> Server:
                 f"MLflow's store cannot lie at {str(database)!a}: {character!a} has another meaning in its "
                 "URL. Choose another folder, or name an MLflow server: --tracking-uri http://HOST:PORT"
             )
-    return Server(f"{_SCHEME}{database}", artifacts=database.parent / "mlartifacts")
+    return Server(f"{_SCHEME}{database}", artifacts=database.parent / "mlartifacts", own=own)
 
 
 def sqlite_file(uri: str) -> Path | None:
@@ -62,10 +64,14 @@ def prepare_store(server: Server) -> None:
     ------
     StorageError
         The file is no database, or holds runs in tables that this MLflow does not use.
+    UnsafeFileError
+        The store is the folder's own, and it or its artifacts lead out of the folder.
     """
     database = sqlite_file(server.uri)
     if database is None:
         return
+    if server.own:
+        _refuse_links(database)
     if not _is_whole(database):
         database.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{database}.lock").acquire(timeout=_SECONDS):
@@ -74,6 +80,8 @@ def prepare_store(server: Server) -> None:
                 _make(database)
     if server.artifacts:
         _correct_places(database, server.artifacts)
+    if server.own and server.artifacts:
+        _refuse_places_elsewhere(database, server.artifacts)
 
 
 def _is_whole(database: Path) -> bool:
@@ -141,6 +149,42 @@ def _correct_places(database: Path, artifacts: Path) -> None:
                     {"here": here, "there": there},
                 )
     log.warning("MLflow's store %s was moved or copied: its artifacts are taken from %s", database, artifacts)
+
+
+@cache
+def _refuse_links(database: Path) -> None:
+    """Refuse, once a process, a store whose file or artifacts are links: MLflow would write through them."""
+    resolve_within(database.parent, database.name)
+    artifacts = resolve_within(database.parent, "mlartifacts")
+    for folder, folders, files in os.walk(artifacts):
+        link = next((name for name in (*folders, *files) if os.path.islink(os.path.join(folder, name))), None)
+        if link is not None:
+            raise UnsafeFileError(
+                f"{folder} holds a link, {link!r}, through which MLflow would write. If it is yours, name the store: "
+                f"--tracking-uri {_SCHEME}{database}"
+            )
+
+
+def _refuse_places_elsewhere(database: Path, artifacts: Path) -> None:
+    """Refuse a store that notes artifacts of our runs outside the folder ``artifacts``."""
+    root = Path(os.path.realpath(artifacts))
+    with _opened(database) as connection:
+        for (place,) in connection.execute(_OUR_PLACES, {"name": EXPERIMENT}):
+            local = url2pathname(urlsplit(place).path) if urlsplit(place).scheme == "file" else None
+            if local is None or not Path(os.path.realpath(local)).is_relative_to(root):
+                raise UnsafeFileError(
+                    f"{database} notes artifacts at {place!r}, outside its folder. If you put them there, name the "
+                    f"store: --tracking-uri {_SCHEME}{database}"
+                )
+
+
+_OUR_PLACES = """
+WITH ours AS (SELECT experiment_id FROM experiments WHERE name = :name)
+SELECT artifact_location FROM experiments WHERE name = :name
+UNION SELECT artifact_uri FROM runs WHERE experiment_id IN ours
+UNION SELECT artifact_location FROM logged_models WHERE experiment_id IN ours
+"""
+"""Wherever something of the project's experiment is written to."""
 
 
 def _holds_artifacts(connection: sqlite3.Connection, there: str, artifacts: Path) -> bool:

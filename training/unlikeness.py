@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from datagen.errors import DsffnetError
 from datagen.mesh import Mesh, bounding_box, edges_of
-from training.alignment import POOR_ERROR, Axes, Orientation, axes_as_options
+from training.alignment import POOR_ERROR, TURN, Axes, Orientation, axes_as_options
 from training.provenance import FILE, Provenance, provenance_of
 
 if TYPE_CHECKING:
@@ -129,7 +129,10 @@ def remarks(
 def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes] | None) -> str:
     """What speaks against a mesh that stands by ``axes``; how it stands is said only where it is certain."""
     if both and way.is_certain:
-        return f"{name} seems to stand {way.axes}, the training data {axes}: add --align, or {axes_as_options(*both)}"
+        return (
+            f"{name} seems to stand {way.axes}, to within {TURN:.0f} degrees about the vertical, the training data "
+            f"{axes}: add --align, or {axes_as_options(*both)}"
+        )
     if way.error(axes) > POOR_ERROR:
         return (
             f"{name} comes back from the network as another shape (PMD {way.error(axes):.3f} onto itself): it is "

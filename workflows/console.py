@@ -204,7 +204,7 @@ def server_of(out: Path, uri: str | None) -> Server:
     database = sqlite_file(uri or "")
     if database:
         return sqlite_server(Path(require_reachable(str(database), option="--tracking-uri sqlite:///")))
-    return Server(uri) if uri else sqlite_server(out.absolute() / "mlflow.db")
+    return Server(uri) if uri else sqlite_server(out.absolute() / "mlflow.db", own=True)
 
 
 def server_of_record(root: Path, uri: str | None) -> Server:
@@ -225,8 +225,7 @@ def remove_run(run: Path) -> None:
     if run.exists() and any(run.iterdir()) and not _is_training(run):
         raise RecipeError(f"{run} is not the folder of a training, so --fresh leaves it alone. Choose another --out")
     _remove(run, _OF_A_RUN)
-    for folder in run.glob("evaluation*"):
-        shutil.rmtree(folder)
+    _remove(run, [folder.name for folder in run.glob("evaluation*")])
 
 
 def _is_training(run: Path) -> bool:
@@ -239,7 +238,7 @@ def _is_training(run: Path) -> bool:
 
 def _remove(folder: Path, names: Iterable[str]) -> None:
     for path in (folder / name for name in names):
-        if path.is_dir():
+        if path.is_dir() and not path.is_symlink():  # of a link, only the link
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)

@@ -8,7 +8,9 @@ from datagen.sizes import require_disk, size_of
 from datagen.store import open_dataset
 from datagen.store.objects import is_local, plain
 from datagen.store.schema import check_extent
+from workflows.cluster import on_cluster
 from workflows.stages import say
+from workflows.tasks import RAY_FROM_MESHES
 
 
 def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, local: bool = False) -> None:
@@ -34,8 +36,10 @@ def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, loc
     """
     if not anew and _is_whole(url):
         return
-    one_task = local or "RAY_ADDRESS" in os.environ  # of a cluster, this machine's memory says nothing of the others'
-    size = size_of(recipe, workers=1 if one_task else os.cpu_count() or 1)
+    one_task = local or on_cluster()  # of a cluster, this machine's memory says nothing of the others'
+    size = size_of(recipe, workers=1)
+    if not one_task and size.meshes >= RAY_FROM_MESHES:
+        size = size_of(recipe, workers=os.cpu_count() or 1)
     check_extent(url, recipe)
     say(f"generate: {size}")
     if is_local(url) and not yes:

@@ -4,6 +4,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
+from datagen.files import resolve_within
 from datagen.store import Dataset
 from training.checkpoint import Checkpoint, Which, require_checkpoint
 
@@ -32,7 +33,9 @@ class Evaluated:
         """HOME/evaluation[-DATASET][-LABEL]; DATASET where it is another than the weights were trained on."""
         own = self.checkpoint.dataset == dataset.uuid
         other = "" if own else Path(dataset.url).stem
-        return self.home / "-".join(filter(None, ("evaluation", other, self.label)))
+        name = "-".join(filter(None, ("evaluation", other, self.label)))
+        resolve_within(self.home, name)
+        return self.home / name
 
 
 def evaluated(place: Path, which: Which = "result") -> Evaluated:

@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
     recipe = load_recipe(options.recipe, options.set)
     name = Path(options.recipe).stem
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
-    announce_size(recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
+    announce_size(recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes, local=options.local)
     server = server_of(out, options.tracking_uri)
     mirror = Mirror(out, server)
     with alone_in(out):

@@ -21,7 +21,7 @@ _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes thr
 _START_SECONDS = (30.0, 150.0)  # Ray's own patience with its node, and ours after that
 _SERVERS = ("gcs_server", "raylet")
 _LOOK_SECONDS, _LEAVE_SECONDS = 0.5, 20.0
-WITHOUT_RAY = "--local (dsffnet train: --set training.launcher=inline training.ranks=1)"
+WITHOUT_RAY = "--local, where the command has it (dsffnet train: --set training.launcher=inline training.ranks=1)"
 
 
 def _start() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from datagen.errors import DsffnetError
-from datagen.files import read_text_within
+from datagen.files import read_text_within, refuse_links_out
 from datagen.generate import generate
 from datagen.grid import Grid
 from datagen.mesh import bounding_box, write_atomically
@@ -46,7 +46,15 @@ _CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
 
 @contextmanager
 def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, parameters: dict[str, Any]) -> Iterator[None]:
-    """Keep a record in ``folder`` while the block runs, and end it as FINISHED, FAILED or KILLED."""
+    """Keep a record in ``folder`` while the block runs, and end it as FINISHED, FAILED or KILLED.
+
+    Raises
+    ------
+    UnsafeFileError
+        A link in the folder leads out of it: what is written there would go elsewhere.
+    """
+    if parent:  # the outermost folder may hold links of its owner's, such as a dataset on another disk
+        refuse_links_out(folder)
     begin_record(folder, name=name, kind=kind, parent=parent, parameters=flatten(parameters))
     try:
         yield

@@ -208,7 +208,7 @@ def remove_sweep(out: Path, *, kind: str = "sweep", own: Sequence[str] = _OWN) -
         )
     start_over(out)
     for path in (out / name for name in own):
-        if path.is_dir():
+        if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)

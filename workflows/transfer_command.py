@@ -9,6 +9,7 @@ from pathlib import Path
 
 from datagen.errors import RecipeError
 from datagen.printable import printable
+from datagen.resources import memory_errors
 from workflows.commands import add_command, print_text
 from workflows.evaluated import evaluated, which_checkpoint
 
@@ -75,8 +76,9 @@ def transfer_command(options: argparse.Namespace) -> None:
         from workflows.transfer_work import TransferWork
 
         work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
-        work.settle_axes(weights)
-        print_text(printable(work.run()))
+        with memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"):
+            work.settle_axes(weights)
+            print_text(printable(work.run()))
 
 
 @contextmanager

@@ -36,7 +36,7 @@ def ui_command(options: argparse.Namespace) -> None:
 
 
 def _server(database: Path, port: int) -> list[str]:
-    server = sqlite_server(database)
+    server = sqlite_server(database, own=True)
     prepare_store(server)
     return [
         *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
@@ -63,7 +63,7 @@ def _parent_is_gone() -> Callable[[], bool]:
 
 
 def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
-    """Run a server until it ends by itself (its status), or is told to: by a signal, or by ``ended`` (0)."""
+    """Run a server until it ends by itself (its status), or ``ended`` says so (0); a signal ends it too."""
     signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # a closed terminal, of nohup too
     quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes fewer
     keeper = subprocess.Popen(
@@ -77,8 +77,6 @@ def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
         while keeper.poll() is None and not ended():
             time.sleep(_LOOK_SECONDS)
         return keeper.poll() or 0
-    except KeyboardInterrupt:
-        return 0
     finally:
         keeper.stdin.close()
         keeper.wait()

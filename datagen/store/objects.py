@@ -14,7 +14,7 @@ from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteReque
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from datagen.errors import UnsafeFileError
+from datagen.errors import DatasetError, UnsafeFileError
 from datagen.files import open_regular, read_bounded, resolve_within
 from datagen.store.object_names import is_leftover, limit_of, require_member, require_short
 from datagen.store.remote_objects import S3_OPTIONS, RemoteObjects
@@ -69,7 +69,13 @@ class LocalObjects(LocalStore):
         parent, _, name = path.rpartition("/")
         place = (resolve_within(self.root, parent) if parent else self.root) / name
         if place.is_dir() and not place.is_symlink():
-            place.rmdir()
+            try:
+                place.rmdir()
+            except OSError as error:
+                raise DatasetError(
+                    f"{self.root}: a folder that holds something is in the place of {path}. Look whose it is, move it "
+                    "away, and run the same command again"
+                ) from error
         return place
 
     def get_sync(

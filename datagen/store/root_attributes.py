@@ -70,5 +70,12 @@ def attributes_fault(group: zarr.Group) -> str | None:
 
 
 def _is_tree(joints: list[str], parents: list[Any]) -> bool:
-    """Whether every joint's parent is another joint, -1 standing for none."""
-    return len(joints) == len(parents) and all(-1 <= parent < len(joints) for parent in parents)
+    """Whether every joint leads up to a root, whose parent is -1."""
+    if len(joints) != len(parents) or not all(-1 <= parent < len(joints) for parent in parents):
+        return False
+    rooted = {-1}
+    for _ in joints:
+        rooted |= {joint for joint, parent in enumerate(parents) if parent in rooted}
+        if len(rooted) > len(joints):
+            return True
+    return not joints

@@ -129,3 +129,11 @@ def test_coefficients_under_the_names_of_their_curves() -> None:
     assert found["alpha/block1.norm2"] == 0.5 and found["beta/block3.norm1"] == 0.0 and len(found) == 12
     assert coefficient_metrics(nn.ModuleDict({"module": network})["module"]) == found
     assert coefficient_metrics(nn.Linear(2, 2)) == {}
+
+
+def test_a_link_to_what_is_not_there_yet_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").symlink_to(tmp_path / "victim")
+    with pytest.raises(UnsafeFileError, match="link"):
+        Journal(tmp_path / "run" / "metrics.jsonl")
+    assert not (tmp_path / "victim").exists()

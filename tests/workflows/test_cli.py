@@ -126,7 +126,9 @@ def test_a_full_disk_is_one_error_and_going_on_ends_with_the_same_bytes(tmp_path
     assert command(*arguments, "--out", undisturbed).returncode == 0
     with small_disk(tmp_path / "disk", kibibytes=600) as disk:
         data = disk / "leg.zarr"
-        fails(command(*arguments, "--out", data), 1, "No space left on device", "What was complete is untouched")
+        fails(
+            command(*arguments, "--out", data, "--yes"), 1, "No space left on device", "What was complete is untouched"
+        )
         assert "building" in command("inspect", data).stdout
         grow(disk, kibibytes=16_000)
         assert command(*arguments, "--out", data).returncode == 0

@@ -193,14 +193,44 @@ def test_a_store_that_was_moved_or_copied_shows_the_artifacts_beside_it(tmp_path
         assert client.get_model_version_download_uri("legs", "1").startswith(place.as_uri())
 
 
-def test_artifacts_that_a_person_put_elsewhere_stay_there(tmp_path: Path, empty_store: Path) -> None:
+def test_artifacts_elsewhere_are_written_only_where_a_person_names_the_store(tmp_path: Path, empty_store: Path) -> None:
+    """A stranger's folder may bring a store whose runs lie in somebody's home."""
     out = recorded(tmp_path / "out", empty_store)
     elsewhere = (tmp_path / "elsewhere" / "mlartifacts").as_uri()
     mlflow.MlflowClient(server(out).uri).create_experiment(EXPERIMENT, elsewhere)
     (out / "mlartifacts").mkdir()
+    with pytest.raises(TrackingError, match="outside its folder"):
+        publish(out, server(out))
+    assert not (tmp_path / "elsewhere").exists()
+    publish(out, server_of(out, server(out).uri))
+    assert any((tmp_path / "elsewhere").rglob("curve.png"))
+
+
+@pytest.mark.parametrize("place", ["file:///../..", "file:{out}/mlartifacts/../..", "/tmp", "s3://bucket/x"])
+def test_a_run_of_a_store_that_came_with_its_folder_is_written_beside_it(
+    tmp_path: Path, empty_store: Path, place: str
+) -> None:
+    out = recorded(tmp_path / "out", empty_store)
     publish(out, server(out))
-    publish(out, server(out))
-    assert the_run(out).info.artifact_uri.startswith(elsewhere)
+    (out / "mlflow.json").unlink()
+    (out / "figures" / "curve.png").write_bytes(b"another")
+    execute(out / "mlflow.db", f"UPDATE runs SET artifact_uri = '{place.format(out=out)}'")
+    before = tree_hash(out / "mlartifacts")
+    with pytest.raises(TrackingError, match="outside its folder"):
+        publish(out, server(out))
+    assert tree_hash(out / "mlartifacts") == before and not (tmp_path / "figures").exists()
+
+
+@pytest.mark.parametrize("name", ["mlflow.db", "mlartifacts", "mlartifacts/1/x/artifacts/figures/curve.png"])
+def test_links_of_a_store_are_not_written_through(tmp_path: Path, empty_store: Path, name: str) -> None:
+    out, victim = recorded(tmp_path / "out"), tmp_path / "victim"
+    shutil.copy(empty_store, victim)
+    (out / name).parent.mkdir(parents=True, exist_ok=True)
+    (out / name).symlink_to(victim)
+    before = victim.read_bytes()
+    with pytest.raises(TrackingError, match="link"):
+        publish(out, server(out))
+    assert victim.read_bytes() == before
 
 
 def test_a_second_command_on_one_folder_says_so_at_once_and_changes_nothing(

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from datagen import mesh_sequences
-from datagen.errors import DsffnetError, MeshError, RecipeError, StorageError
+from datagen.errors import DsffnetError, MeshError, OutOfMemory, RecipeError, StorageError
 from datagen.generate import generate
 from datagen.mesh import Mesh, load_mesh, save_mesh
 from datagen.mesh_files import MeshFile
@@ -229,7 +230,7 @@ def test_an_interruption_keeps_what_is_finished_and_breaks_nothing(
         return read(job, number)
 
     monkeypatch.setattr(TransferJob, "read_source", until_ctrl_c)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match=r"first 7 frames are finished, in .*walked\.unfinished; the same comm"):
         transfer("walk", "person.obj", "-o", tmp_path / "walked", "--refine")
     assert {path.name: path.read_bytes() for path in (tmp_path / "walked").iterdir()} == before
     assert files(tmp_path / "walked.unfinished") == [f"frame_{number}.obj" for number in range(7)]
@@ -242,6 +243,77 @@ def test_a_first_frame_that_is_broken_leaves_nothing_behind(transfer: Transfer, 
     with pytest.raises(MeshError, match=r"0\.obj"):
         transfer(walk, "person.obj", "-o", tmp_path / "walked")
     assert files(tmp_path) == before
+
+
+BALL = trimesh.creation.icosphere(1)
+ROUND, TRIANGLES = np.asarray(BALL.vertices) * (0.3, 1.0, 0.2), np.asarray(BALL.faces)
+COUNT = len(ROUND)
+ODD: dict[str, tuple[NDArray[np.floating], NDArray[np.integer]]] = {
+    "faces of two corners": (ROUND, np.concatenate([TRIANGLES, [[0, 0, 1], [2, 2, 2]]])),
+    "every face twice": (ROUND, np.concatenate([TRIANGLES, TRIANGLES])),
+    "every vertex twice": (np.concatenate([ROUND, ROUND]), np.concatenate([TRIANGLES, TRIANGLES + COUNT])),
+    "vertices of no face": (np.concatenate([ROUND, 1.1 * ROUND, 1.2 * ROUND]), TRIANGLES),
+    "faces without area": (np.concatenate([ROUND, ROUND[[0, 0, 0]]]), np.concatenate([TRIANGLES, [[42, 43, 44]]])),
+    "no face with an area": (ROUND, np.array([[0, 1, 0], [1, 1, 2]])),
+    "one face": (ROUND, TRIANGLES[:1]),
+    "inside out": (ROUND, TRIANGLES[:, ::-1]),
+    "four faces at an edge": (ROUND, np.concatenate([TRIANGLES, [[0, 1, 20], [0, 1, 30]]])),
+    "far away": (ROUND + 1e7, TRIANGLES),
+    "in nanometres": (ROUND * 1e9, TRIANGLES),
+    "in light years": (ROUND * 1e-14, TRIANGLES),
+}
+UNUSABLE: dict[str, tuple[NDArray[np.floating], NDArray[np.integer], str]] = {
+    "not a number": (np.where(np.arange(COUNT)[:, None] == 5, np.nan, ROUND), TRIANGLES, "the first is number 5"),
+    "infinite": (np.where(np.arange(COUNT)[:, None] == 5, np.inf, ROUND), TRIANGLES, "the first is number 5"),
+    "a face beyond the last vertex": (ROUND, np.array([[0, 1, 99]]), "vertex 100, but there are 42"),
+    "too large to be squared": (ROUND * 1e200, TRIANGLES, r"coordinates up to 1e\+200: scale it"),
+    "too small to be squared": (ROUND * 1e-200, TRIANGLES, "long at most: scale it"),
+    "so far away that it has no form": (ROUND + 1e17, TRIANGLES, "scale it"),
+    "one place": (ROUND * 0 + 1, TRIANGLES, "no extent"),
+}
+
+
+def written_obj(path: Path, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> Path:
+    lines = ["v {!r} {!r} {!r}".format(*map(float, row)) for row in vertices]
+    lines += ["f {} {} {}".format(*row) for row in (faces + 1).tolist()]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("what", sorted(ODD))
+def test_odd_meshes_are_posed_without_a_number_that_is_none(transfer: Transfer, tmp_path: Path, what: str) -> None:
+    odd = written_obj(tmp_path / "odd.obj", *ODD[what])
+    transfer(odd, "person.obj", "-o", tmp_path / "as_source.obj", "--align")
+    transfer("pose.obj", odd, "-o", tmp_path / "as_target.obj", "--refine")
+    assert len(load_mesh(tmp_path / "as_source.obj").vertices) == len(load_mesh("person.obj").vertices)
+    assert len(load_mesh(tmp_path / "as_target.obj").vertices) == len(ODD[what][0])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("what", sorted(UNUSABLE))
+@pytest.mark.parametrize("role", ["source", "target"])
+def test_unusable_meshes_are_one_line_before_any_work(
+    transfer: Transfer, tmp_path: Path, what: str, role: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PoseTransfer, "from_run", None)
+    *mesh, says = UNUSABLE[what]
+    bad = written_obj(tmp_path / "bad.obj", *mesh)
+    with pytest.raises(MeshError, match=says) as caught:
+        transfer(*((bad, "person.obj") if role == "source" else ("pose.obj", bad)), "-o", tmp_path / "x.obj")
+    assert "\n" not in str(caught.value) and str(bad) in str(caught.value) and files(tmp_path) == ["bad.obj"]
+
+
+def test_memory_that_runs_out_is_one_line_about_the_meshes(
+    transfer: Transfer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def vertices(*_: object) -> None:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 99 bytes")
+
+    monkeypatch.setattr(PoseTransfer, "vertices", vertices)
+    with pytest.raises(OutOfMemory, match=r"memory ran out .*decimate"):
+        transfer("pose.obj", "person.obj", "-o", tmp_path / "x.obj")
+    assert not files(tmp_path)
 
 
 def test_more_frames_than_an_animation_holds_are_said_before_any_is_made(

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from datagen.errors import UnsafeFileError
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from tests.support.workflows import finished_workflow
@@ -130,3 +131,21 @@ def test_a_run_has_the_permissions_of_the_umask(tmp_path: Path, dataset: str) ->
     for path in (tmp_path / "run").rglob("*"):
         assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0, path
     assert json.loads((tmp_path / "run" / "record.json").read_text())["status"] == "FINISHED"
+
+
+@pytest.mark.parametrize("name", ["figures", "tables.md", "record.json", "measured"])
+def test_links_that_lead_out_of_a_stage_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "record.json").write_text("{}")
+    (tmp_path / "run" / "evaluation").mkdir(parents=True)
+    (tmp_path / "run" / "evaluation" / name).symlink_to(victim if "." not in name else victim / "record.json")
+    with (
+        pytest.raises(UnsafeFileError, match="link"),
+        pipeline.recorded(
+            tmp_path / "run" / "evaluation", kind="evaluate", name="x", parent=tmp_path / "run", parameters={}
+        ),
+    ):
+        pytest.fail("it began")
+    assert [path.name for path in victim.iterdir()] == ["record.json"]
+    assert (victim / "record.json").read_text() == "{}"
