@@ -1,8 +1,6 @@
-"""What refinement and alignment are worth: ``python -m benchmarks.transfer_quality RUN DATA [--triples 100]``.
+"""What refinement is worth: ``python -m benchmarks.transfer_quality RUN DATA [--triples 100]``.
 
-Refinement: the dataset's unseen evaluation triples, whose truth is known, by weight. Alignment: how often every target
-of those triples (an identity and a pose that training never saw) is left alone as it stands, and how often the way is
-found when it is laid otherwise. Laying a mesh only permutes its 24 errors, so they are measured once.
+By weight, over the dataset's unseen evaluation triples, whose truth is known.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import pytest
 import zarr
 from numcodecs import Zstd
 
-from datagen.errors import DatasetError, DsffnetError, StorageError
+from datagen.errors import DatasetError, DsffnetError
 from datagen.generate import append, generate, repair
 from datagen.store import open_dataset
 from datagen.store.object_names import is_member
@@ -349,7 +349,7 @@ def test_fresh_removes_links_and_not_what_they_lead_to(
 def test_a_folder_in_a_shards_place_that_holds_something_is_left_alone(spoilable: Path) -> None:
     folder(SHARD)(spoilable)
     (spoilable / SHARD / "thesis.txt").write_text("precious")
-    with pytest.raises(StorageError, match="not empty"):
+    with pytest.raises(DatasetError, match="move it away"):
         repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
     assert (spoilable / SHARD / "thesis.txt").read_text() == "precious"
 
