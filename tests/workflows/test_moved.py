@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from datagen.generate import generate, inline
+from datagen.generate import generate
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipe import EvaluationRecipe
 from training.record import read_record
-from workflows import pipeline
 from workflows.console import WorkflowError, alone_in
 from workflows.evaluated import evaluated
 from workflows.pipeline import about_dataset, evaluate_stage, is_evaluated, is_trained, train_stage
 from workflows.probes import about_weights
+from workflows.tasks import TaskRunner
 
 RECIPE = EvaluationRecipe(emd_points=16, examples=1, chunk=4)
 
@@ -23,10 +23,9 @@ def workflow(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset, a training and its evaluation in one folder, made in this process."""
     out = tmp_path_factory.mktemp("workflow") / "out"
     shutil.copytree(_pristine, out / "dataset.zarr")
-    train_stage(tiny_training(), str(out / "dataset.zarr"), out / "run", parent=None)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "ray_runner", inline)
-        evaluate_stage(RECIPE, str(out / "dataset.zarr"), out / "run", parent=out / "run")
+    tasks = TaskRunner(local=True)
+    train_stage(tiny_training(), str(out / "dataset.zarr"), out / "run", parent=None, tasks=tasks)
+    evaluate_stage(RECIPE, str(out / "dataset.zarr"), out / "run", parent=out / "run", tasks=tasks)
     return out
 
 
@@ -48,5 +47,7 @@ def test_a_second_evaluation_of_one_run_says_so_and_changes_nothing(workflow: Pa
     folder = workflow / "run" / "evaluation"
     before = (folder / "record.json").read_bytes()
     with alone_in(folder), pytest.raises(WorkflowError, match=r"another command is at work in .*run/evaluation\."):
-        evaluate_stage(RECIPE, str(workflow / "dataset.zarr"), workflow / "run", parent=None)
+        evaluate_stage(
+            RECIPE, str(workflow / "dataset.zarr"), workflow / "run", parent=None, tasks=TaskRunner(local=True)
+        )
     assert (folder / "record.json").read_bytes() == before

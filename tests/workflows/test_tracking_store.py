@@ -252,12 +252,12 @@ def test_a_second_command_on_one_folder_says_so_at_once_and_changes_nothing(
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 def test_make_ui_takes_what_the_closing_words_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Makefile of this repository beside an ``mlflow`` that only says what it was asked for."""
+    """The Makefile of this repository beside a ``dsffnet`` that only says what it was asked for."""
     shutil.copy(ROOT / "Makefile", tmp_path)
     for name in ("constraints.txt", "pyproject.toml", "deploy/requirements.txt", ".venv/.ready"):
         (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
         (tmp_path / name).touch()
-    program = tmp_path / ".venv" / "bin" / "mlflow"
+    program = tmp_path / ".venv" / "bin" / "dsffnet"
     program.parent.mkdir()
     program.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
     program.chmod(0o755)
@@ -269,4 +269,4 @@ def test_make_ui_takes_what_the_closing_words_say(tmp_path: Path, monkeypatch: p
     said = closing_words(out, server(out)).splitlines()
     command = next(line for line in said if line.startswith("  make ui"))
     asked = subprocess.run(command, shell=True, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert f"sqlite:///{out}/mlflow.db" in asked and f"{out}/mlartifacts" in asked
+    assert asked[0] == "ui" and Path(asked[-1]).resolve() == out
