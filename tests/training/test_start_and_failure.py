@@ -93,8 +93,12 @@ def test_a_picture_that_cannot_be_written_is_a_warning(dataset: str, tmp_path: P
 
 
 def test_a_journal_that_cannot_be_synced_is_one_storage_error(dataset: str, tmp_path: Path, monkeypatch) -> None:
-    def broken(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
+    journal, fsync = tmp_path / "metrics.jsonl", os.fsync
+
+    def broken(descriptor: int) -> None:
+        if journal.exists() and os.path.samestat(os.fstat(descriptor), journal.stat()):
+            raise OSError(errno.EIO, "Input/output error")
+        fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", broken)
     with pytest.raises(StorageError, match=r"metrics\.jsonl: Input/output error"):
