@@ -4,6 +4,7 @@ import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -91,17 +92,25 @@ def test_appending_a_million_million_is_refused(spoilable: Path, capsys: Printed
     refused(lambda: cli.main(["append", str(spoilable), "--seen", "9" * 400, "--local"]), 2, "has 63", capsys)
 
 
-def test_on_a_cluster_this_machine_is_not_asked_for_the_memory_of_every_worker(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("meshes", "address", "local", "workers"),
+    [(5_000, "", False, 64), (5_000, "", True, 1), (5_000, "head:6379", False, 1), (4_999, "", False, 1)],
+)
+def test_memory_is_asked_for_the_workers_that_this_machine_has_at_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, meshes: int, address: str, local: bool, workers: int
 ) -> None:
-    asked = []
-    monkeypatch.setattr(data_size, "size_of", lambda recipe, workers: asked.append(workers))
+    """One where little is made, which needs no Ray; one of a cluster, whose other machines have memory of their own."""
+    asked: list[int] = []
+
+    def size(recipe: object, workers: int) -> SimpleNamespace:
+        asked.append(workers)
+        return SimpleNamespace(meshes=meshes)
+
+    monkeypatch.setattr(data_size, "size_of", size)
     monkeypatch.setattr("os.cpu_count", lambda: 64)
-    for address, local in ((None, False), (None, True), ("head:6379", False)):
-        if address:
-            monkeypatch.setenv("RAY_ADDRESS", address)
-        announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True, local=local)
-    assert asked == [64, 1, 1]
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True, local=local)
+    assert max(asked) == workers
 
 
 def test_a_grid_of_a_hundred_million_trials_is_refused() -> None:
