@@ -30,11 +30,6 @@ HEADER = 2**14
 """Bytes in which the header of an .npy file ends: NumPy takes none of more than 10,000 letters."""
 
 
-def reason(error: BaseException) -> str:
-    """What an error says of itself; its kind where it says nothing."""
-    return str(error) or type(error).__name__
-
-
 @contextmanager
 def opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive for reading.

@@ -10,6 +10,8 @@ import stat
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 
+from filelock import FileLock
+
 from datagen.errors import DamagedFileError, UnsafeFileError
 
 TEXT_LIMIT = 16 * 2**20
@@ -54,11 +56,16 @@ def open_regular(path: Path) -> BufferedReader:
     Raises
     ------
     UnsafeFileError
-        It is not a regular file (a device, a pipe, a folder).
+        It is not a regular file (a device, a pipe, a socket, a folder).
     OSError
         It is not there, or cannot be read.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not wait
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not wait
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise UnsafeFileError(f"{path} is not a regular file") from error
+        raise
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return open(descriptor, "rb")
     os.close(descriptor)
@@ -110,6 +117,20 @@ def read_text_within(folder: Path, name: str, *, limit: int = TEXT_LIMIT) -> str
         return read_within(folder, name, limit=limit).decode()
     except UnicodeDecodeError as error:
         raise DamagedFileError(f"{folder / name} is not a text in UTF-8 ({error.reason})") from error
+
+
+def lock_within(folder: Path, name: str) -> FileLock:
+    """Return the lock that a file in a folder is; the file is made when the lock is taken.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is a link that leads out of the folder, where another file would be made or opened, or no regular file.
+    """
+    path = resolve_within(folder, name)
+    if path.exists() and not path.is_file():
+        raise UnsafeFileError(f"{path} is not a regular file. Remove it, then run again")
+    return FileLock(path)
 
 
 def sync_folder(folder: Path) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, LARGEST, array_header, member_bytes, member_header, opened, reason
-from datagen.errors import BodyError
+from datagen.archives import FAULTS, LARGEST, array_header, member_bytes, member_header, opened
+from datagen.errors import BodyError, reason_of
 from datagen.mesh import write_atomically
 from datagen.recorded_arrays import array_of, require_size
 from datagen.unpickling import unpickle
@@ -81,7 +81,7 @@ def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             require_size(sum(member.file_size for member in members), name=str(path))
             return {key: _read_member(archive, key, path) for key in keys if f"{key}.npy" in there}
     except FAULTS as error:
-        raise BodyError(f"{path} is damaged ({reason(error)}); copy or download it again") from error
+        raise BodyError(f"{path} is damaged ({reason_of(error)}); copy or download it again") from error
 
 
 def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:

@@ -17,7 +17,7 @@ import re
 import struct
 from typing import Any, BinaryIO, ClassVar
 
-from datagen.errors import BodyError
+from datagen.errors import BodyError, reason_of
 
 _GLOBALS = re.compile(
     r"(?P<reconstruct>numpy\.(?:_core|core)\.multiarray\._reconstruct)"
@@ -152,5 +152,4 @@ def unpickle(file: BinaryIO, *, name: str) -> Any:
     except BodyError:
         raise
     except Exception as error:  # a damaged pickle makes the unpickler raise nearly anything
-        reason = str(error) or type(error).__name__
-        raise BodyError(f"{name} cannot be read as a pickle ({reason}); copy or download it again") from error
+        raise BodyError(f"{name} cannot be read as a pickle ({reason_of(error)}); copy or download it again") from error

@@ -14,10 +14,11 @@ from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from torch import Tensor
 
 from datagen.errors import DsffnetError, StorageError
+from datagen.files import lock_within
 from training.recipe import TrainingRecipe
 
 _Answer = TypeVar("_Answer")
@@ -127,7 +128,7 @@ def alone_in(run: Path, ranks: Ranks) -> Iterator[None]:
     TrainingError
         On every rank, if another process has it.
     """
-    lock = FileLock(run / ".lock")
+    lock = lock_within(run, ".lock")
 
     def acquire() -> None:
         run.mkdir(parents=True, exist_ok=True)

@@ -21,10 +21,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
-
 from datagen.errors import DsffnetError
-from datagen.files import read_within, resolve_within
+from datagen.files import lock_within, read_within, resolve_within
 from datagen.printable import printable, printable_lines
 from training.outbox import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
 from training.record import ALIAS, EXPERIMENT, Record, Server, find_records, parent_of, read_record
@@ -97,7 +95,7 @@ def _publish_record(client: Any, server: Server, folder: Path, failures: list[Ex
     if record is None:
         return
     try:
-        with FileLock(folder / ".mlflow.lock").acquire(timeout=_LOCK_SECONDS):
+        with lock_within(folder, ".mlflow.lock").acquire(timeout=_LOCK_SECONDS):
             _Publication(client, server, folder, record).run()
     except MlflowException as error:
         if error.error_code in _NO_ANSWER:

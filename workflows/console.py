@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from datagen.errors import DsffnetError, RecipeError, reason_of
-from datagen.files import read_text_within
+from datagen.files import lock_within, read_text_within
 from datagen.printable import printable, printable_lines
 from datagen.resources import ran_out_of_memory
 from training.record import ALIAS, EXPERIMENT, MODEL, Server, read_record
@@ -255,7 +255,7 @@ def alone_in(out: Path, name: str = ".lock") -> Iterator[None]:
     """
     out.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(out / name).acquire(timeout=0):
+        with lock_within(out, name).acquire(timeout=0):
             yield
     except Timeout as error:
         raise WorkflowError(f"another command is at work in {out}. Wait for it, or stop it, then run again") from error

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, read_arrays, reason
+from datagen.archives import FAULTS, read_arrays
 from datagen.assets import Asset, file_asset
-from datagen.errors import RecipeError
+from datagen.errors import RecipeError, reason_of
 from datagen.mesh import write_atomically
 from datagen.poses import Poses
 from datagen.poses.skeletons import JOINTS, PARENTS, SMAL_JOINTS, SMAL_PARENTS
@@ -115,7 +115,7 @@ def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     try:
         return read_arrays(path, _ARRAYS)
     except FAULTS as error:
-        raise RecipeError(f"{path} is no .npz file of plain arrays ({reason(error)}). {_MAKE_ONE}") from error
+        raise RecipeError(f"{path} is no .npz file of plain arrays ({reason_of(error)}). {_MAKE_ONE}") from error
 
 
 def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDArray[np.float64]:

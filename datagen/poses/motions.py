@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.archives import FAULTS, Header, member_header, opened, read_arrays, reason
-from datagen.errors import RecipeError
+from datagen.archives import FAULTS, Header, member_header, opened, read_arrays
+from datagen.errors import RecipeError, reason_of
 
 JOINTS_OF_WIDTH = {66: 22, 72: 24, 156: 22, 165: 22}
 """Numbers in a frame (body alone, SMPL, SMPL-H, SMPL-X) -> how many of its first joints are SMPL's."""
@@ -61,7 +61,7 @@ def _motion(path: Path, name: str) -> Motion | None:
             used = _used(archive)
             headers = [member_header(archive, each.filename) for each in used]
     except FAULTS as error:
-        raise RecipeError(f"{path} is no .npz file ({reason(error)}). Fetch it again or take it away") from error
+        raise RecipeError(f"{path} is no .npz file ({reason_of(error)}). Fetch it again or take it away") from error
     if not used:
         return None
     fingerprint = " ".join(f"{each.filename} {each.file_size} {each.CRC:08x}" for each in used)
@@ -101,7 +101,7 @@ def read_frames(motion: Motion) -> NDArray[np.float64]:
         frames = np.concatenate(list(arrays.values()), axis=-1).astype(np.float64)
     except FAULTS as error:
         raise RecipeError(
-            f"{path} cannot be read as a motion ({reason(error)}). Fetch it again or take it away"
+            f"{path} cannot be read as a motion ({reason_of(error)}). Fetch it again or take it away"
         ) from error
     if frames.ndim != 2 or len(frames) != motion.frames or frames.shape[1] not in JOINTS_OF_WIDTH:
         raise RecipeError(f"{path} has changed while it was in use. Run the same command again")

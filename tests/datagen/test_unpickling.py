@@ -343,3 +343,15 @@ def test_damaged_archives_are_one_error(tmp_path: Path, damage: str) -> None:
     (tmp_path / "m.npz").write_bytes(DAMAGES[damage](content.getvalue()))
     with pytest.raises(BodyError, match=r"m\.npz is damaged \(.+\); copy or download it again"):
         read_arrays(tmp_path / "m.npz", ("f",))
+
+
+def test_what_is_said_of_a_damaged_archive_is_short(tmp_path: Path) -> None:
+    """Python quotes the whole name in a member's header, be it thousands of bytes."""
+    content = io.BytesIO()
+    np.savez(content, f=np.zeros((500, 3)))
+    changed = bytearray(content.getvalue())
+    struct.pack_into("<H", changed, 26, 8000)  # the length of the name
+    (tmp_path / "m.npz").write_bytes(changed)
+    with pytest.raises(BodyError, match="is damaged") as caught:
+        read_arrays(tmp_path / "m.npz", ("f",))
+    assert len(str(caught.value)) < 500 + len(str(tmp_path))

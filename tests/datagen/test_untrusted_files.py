@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.errors import UnsafeFileError
-from datagen.files import read_bounded, resolve_within
+from datagen.files import lock_within, read_bounded, resolve_within
 
 
 @pytest.mark.parametrize("name", ["", ".", "/etc/hostname", "../secret", "a/../../secret", "a\0b", "..\\secret"])
@@ -44,7 +44,8 @@ def test_only_regular_files_of_bounded_size_are_read(tmp_path: Path) -> None:
     assert read_bounded(tmp_path / "file", limit=5) == b"12345"
     with pytest.raises(UnsafeFileError, match="4 bytes"):
         read_bounded(tmp_path / "file", limit=4)
-    for path in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
+    os.mknod(tmp_path / "socket", 0o140600)
+    for path in (tmp_path, tmp_path / "pipe", tmp_path / "socket", Path("/dev/zero")):
         with pytest.raises(UnsafeFileError, match="regular"):
             read_bounded(path, limit=10)
     with pytest.raises(FileNotFoundError):
@@ -61,3 +62,14 @@ def test_what_is_too_long_is_not_read(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
+
+
+def test_a_lock_is_a_regular_file_in_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "folder" / "taken").mkdir(parents=True)
+    (tmp_path / "folder" / "link").symlink_to(tmp_path / "made")
+    for name in ("link", "taken"):
+        with pytest.raises(UnsafeFileError):
+            lock_within(tmp_path / "folder", name)
+    with lock_within(tmp_path / "folder", ".lock"):
+        assert (tmp_path / "folder" / ".lock").is_file()
+    assert not (tmp_path / "made").exists()

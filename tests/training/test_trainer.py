@@ -12,7 +12,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from datagen.errors import DatasetError, DsffnetError, RecipeError, StorageError
+from datagen.errors import DatasetError, DsffnetError, RecipeError, StorageError, UnsafeFileError
 from datagen.generate import generate
 from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit
@@ -49,6 +49,14 @@ def test_it_learns(dataset: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(tiny_training(steps=150, learning_rate=0.01), data=dataset, run=run)
     assert losses(run)[-10:].mean() < 0.5 * losses(run)[:5].mean()
+
+
+def test_a_lock_that_is_a_link_makes_nothing_elsewhere(dataset: str, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").symlink_to(tmp_path / "made")
+    with pytest.raises(UnsafeFileError, match="link"):
+        train(tiny_training(), data=dataset, run=tmp_path / "run")
+    assert not (tmp_path / "made").exists()
 
 
 def test_the_journal_holds_every_step_and_the_probe(undisturbed: Path) -> None:
