@@ -55,11 +55,7 @@ def member_bytes(archive: zipfile.ZipFile, name: str, *, limit: int = LARGEST) -
     ValueError
         It declares more than ``limit``, or is packed in another way than NumPy's.
     """
-    member = archive.getinfo(name)
-    if member.file_size > limit:
-        raise ValueError(f"{name} would take {member.file_size:,} bytes, at most {limit:,} are read")
-    if member.compress_type not in _METHODS:
-        raise ValueError(f"{name} is packed by method {member.compress_type}, which NumPy does not use")
+    member = _bounded(archive, name, limit)
     with archive.open(member) as content:
         return content.read(member.file_size)
 
@@ -84,18 +80,26 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     return found
 
 
+def _bounded(archive: zipfile.ZipFile, name: str, limit: int) -> zipfile.ZipInfo:
+    """A member of which no more is unpacked than it declares; it declares no more than ``limit``."""
+    member = archive.getinfo(name)
+    if member.file_size > limit:
+        raise ValueError(f"{name} would take {member.file_size:,} bytes, at most {limit:,} are read")
+    if member.compress_type not in _METHODS:
+        raise ValueError(f"{name} is packed by method {member.compress_type}, which NumPy does not use")
+    return member
+
+
 def member_header(archive: zipfile.ZipFile, name: str) -> Header:
     """Shape and type of the array that a member holds; no more than its beginning is unpacked.
 
     Raises
     ------
     ValueError
-        It holds none, or would take more than :data:`LARGEST`, or is shorter than its shape: NumPy would take the
-        memory first.
+        It holds none, or would take more than :data:`LARGEST`, or is packed in another way than NumPy's, or is
+        shorter than its shape: NumPy would take the memory first.
     """
-    member = archive.getinfo(name)
-    if member.file_size > LARGEST:
-        raise ValueError(f"{name} would take {member.file_size:,} bytes, at most {LARGEST:,} are read")
+    member = _bounded(archive, name, LARGEST)
     with archive.open(member) as content:
         shape, kind = array_header(io.BytesIO(content.read(HEADER)))
     if math.prod(shape) * max(kind.itemsize, 1) > member.file_size and not kind.hasobject:

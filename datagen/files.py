@@ -32,7 +32,10 @@ def resolve_within(folder: Path, name: str) -> Path:
     root = Path(os.path.realpath(folder))
     path = Path(os.path.realpath(root / name))
     if not path.is_relative_to(root) or path.is_symlink():  # what is a link still leads to itself
-        raise UnsafeFileError(f"{folder} names {name!r}, a link that leads out of it. Do not trust what it holds")
+        raise UnsafeFileError(
+            f"{folder} names {name!r}, a link that leads out of it. Do not trust what it holds; a link of "
+            "yours may lead to the whole folder"
+        )
     return path
 
 

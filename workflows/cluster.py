@@ -2,17 +2,15 @@
 
 import logging
 import os
-import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from datagen.errors import ClusterError, RecipeError
 from datagen.printable import printable
-from workflows.own_ray import own_ray
+from workflows.own_ray import own_ray, sigterm_kept
 
 
 def on_cluster() -> bool:
@@ -61,10 +59,7 @@ def ray_cluster() -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    before = signal.getsignal(signal.SIGTERM)
     with _joined() if on_cluster() else own_ray():
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, before)  # Ray's own lets it abort this process
         yield
 
 
@@ -74,7 +69,8 @@ def _joined() -> Iterator[None]:
     import ray
 
     _require_head()
-    ray.init(logging_level=logging.WARNING)
+    with sigterm_kept():
+        ray.init(logging_level=logging.WARNING)
     try:
         _wait_for_cpus()
         yield

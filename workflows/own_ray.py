@@ -17,6 +17,7 @@ from datagen.errors import ClusterError
 from training.background import background
 
 _ROOT = Path(__file__).resolve().parents[1]
+_PACKAGE = f"-packages{os.sep}ray{os.sep}"  # where Ray's own programs lie, in any environment
 _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
 _START_SECONDS = (30.0, 150.0)  # Ray's own patience with its node, and ours after that
 _SERVERS = ("gcs_server", "raylet")
@@ -51,14 +52,32 @@ def _start() -> None:
 def _init() -> None:
     import ray
 
-    ray.init(
-        address="local",
-        include_dashboard=False,
-        object_store_memory=_OBJECT_STORE,
-        logging_level=logging.ERROR,
-        log_to_driver=False,  # errors of tasks and ranks reach the driver anyway; logs: /tmp/ray/session_latest
-        runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
-    )
+    with sigterm_kept():
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            object_store_memory=_OBJECT_STORE,
+            logging_level=logging.ERROR,
+            log_to_driver=False,  # errors of tasks and ranks reach the driver anyway; logs: /tmp/ray/session_latest
+            runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
+        )
+
+
+@contextmanager
+def sigterm_kept() -> Iterator[None]:
+    """Have SIGTERM keep its meaning while Ray connects and after: ``ray.init`` has the signal end the process without
+    a word, and Ray's C++ part puts a handler before that one which prints where the process stood.
+    """
+    from ray._private import utils
+
+    set_handler, before = utils.set_sigterm_handler, signal.getsignal(signal.SIGTERM)
+    utils.set_sigterm_handler = lambda _: None
+    try:
+        yield
+    finally:
+        utils.set_sigterm_handler = set_handler
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -108,9 +127,7 @@ def _kill(processes: list[psutil.Process]) -> None:
 def _is_rays(process: psutil.Process) -> bool:
     with suppress(psutil.Error):
         words = process.cmdline()
-        return process.name() in _SERVERS or any(
-            "ray" in Path(word).parts or word.startswith("ray::") for word in words
-        )
+        return process.name() in _SERVERS or any(_PACKAGE in word or word.startswith("ray::") for word in words)
     return False
 
 

@@ -201,6 +201,6 @@ def _finished_in(folder: Path, own: set[str]) -> str:
     """How many frames are finished, and where a person finds them; a folder without any is removed."""
     finished = sum(path.name in own for path in folder.iterdir())
     if finished:
-        return f"the first {finished:,} frames are finished, in {folder}"
+        return f"{finished:,} {'frame is' if finished == 1 else 'frames are'} finished, in {folder}"
     shutil.rmtree(folder, ignore_errors=True)
     return "no frame is finished"

@@ -1,5 +1,6 @@
 """The benchmarks run: on a GPU machine there is no time to find out that they do not."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -120,3 +121,8 @@ def test_a_step_leaves_no_gradients_and_differences_are_seen() -> None:
     step(network, "float32", torch.optim.SGD(network.parameters(), lr=0.1), meshes)
     assert all(own.grad is None for own in network.parameters())
     assert relative(gradient(network, "float32", meshes), first) > 1e-6
+
+
+@pytest.mark.parametrize("module", sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z]*.py")))
+def test_every_benchmark_finds_what_it_imports(module: str) -> None:
+    importlib.import_module(f"benchmarks.{module}")

@@ -129,6 +129,13 @@ def test_weights_copied_away_from_their_checkpoint_know_themselves(tmp_path: Pat
         require_checkpoint(alone)
 
 
+def test_a_file_of_holes_is_a_fault_at_once(tmp_path: Path) -> None:
+    save(tmp_path, 1)
+    os.truncate(save(tmp_path, 2) / "state.pt", 2**40)
+    found = load_checkpoint(tmp_path)
+    assert found is not None and found.step == 1
+
+
 def test_a_file_of_nothing_but_zeros_is_refused_by_its_header(tmp_path: Path) -> None:
     """Before it is mapped, for which there may be no room."""
     path = tmp_path / "mine.safetensors"

@@ -94,7 +94,7 @@ def test_the_page_holds_its_pictures_and_loads_nothing(tmp_path: Path) -> None:
 
 
 def test_links_of_both_files_lead_to_what_lies_beside_them(tmp_path: Path) -> None:
-    picture, page = png(tmp_path / "deep/a curve (1).png"), tmp_path / "deep/viewer.html"
+    picture, page = png(tmp_path / "reports/deep/a curve (1).png"), tmp_path / "reports/deep/viewer.html"
     page.write_text("<p>turn me</p>")
     reader, markdown = written(tmp_path / "reports", Picture(picture, "The curve"), Page(page, "To be turned"))
     found = [*re.findall(r"\]\(([^)\s]+)\)", markdown), reader.all("iframe")[0]["data-src"]]

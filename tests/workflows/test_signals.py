@@ -42,6 +42,34 @@ def test_a_command_that_waits_for_ray_is_stopped_with_its_own_status(told: signa
     assert said.splitlines()[-1].endswith("run the same command again to go on from here")
 
 
+STARTING = """
+import os, signal
+import ray
+from workflows.console import guarded
+from workflows.cluster import ray_cluster
+connect = ray.init
+
+def connecting(*arguments, **named):
+    connect(*arguments, **named)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+def main():
+    ray.init = connecting
+    with ray_cluster():
+        pass
+
+guarded(main)
+"""
+
+
+def test_a_command_that_is_told_to_stop_while_ray_starts_says_so() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", STARTING], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 143, ended.stderr
+    assert ended.stderr.splitlines()[-1] == "stopped; run the same command again to go on from here"
+
+
 @pytest.mark.parametrize(
     ("told", "status", "words"),
     [(signal.SIGHUP, 129, "stopped"), (signal.SIGTERM, 143, "stopped"), (signal.SIGINT, 130, "interrupted")],

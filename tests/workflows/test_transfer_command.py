@@ -210,7 +210,7 @@ def test_of_a_broken_frame_on_what_is_finished_stays_beside_the_output(
     for unfinished in ("walked.unfinished", "walked.unfinished-2"):
         with pytest.raises(MeshError, match=r"1\.obj"):
             transfer(walk, "person.obj", "-o", tmp_path / "walked")
-        assert f"the first 1 frames are finished, in {tmp_path / unfinished}" in capsys.readouterr().err
+        assert f"1 frame is finished, in {tmp_path / unfinished}" in capsys.readouterr().err
         assert load_mesh(tmp_path / unfinished / "0.obj")
         before = sorted([*before, unfinished, f"{unfinished}/0.obj"])
         assert files(tmp_path) == before
@@ -230,7 +230,7 @@ def test_an_interruption_keeps_what_is_finished_and_breaks_nothing(
         return read(job, number)
 
     monkeypatch.setattr(TransferJob, "read_source", until_ctrl_c)
-    with pytest.raises(KeyboardInterrupt, match=r"first 7 frames are finished, in .*walked\.unfinished; the same comm"):
+    with pytest.raises(KeyboardInterrupt, match=r"7 frames are finished, in .*walked\.unfinished; the same comm"):
         transfer("walk", "person.obj", "-o", tmp_path / "walked", "--refine")
     assert {path.name: path.read_bytes() for path in (tmp_path / "walked").iterdir()} == before
     assert files(tmp_path / "walked.unfinished") == [f"frame_{number}.obj" for number in range(7)]
