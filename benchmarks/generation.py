@@ -23,10 +23,10 @@ from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
 from datagen.bodies.skinning import joint_transforms
+from datagen.common.seeding import Stream, generator
 from datagen.generate import ensure_shard, generate, prepare
 from datagen.grid import Grid, Shard
 from datagen.poses import draw_poses
-from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
 from datagen.store.schema import shard_path
 

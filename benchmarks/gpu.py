@@ -36,11 +36,11 @@ from benchmarks.running import (
     with_every_branch,
 )
 from benchmarks.timing import copy_rate, matrix_rate, measured, release, timed
-from training.acceleration import GraphedTransfer, Precision, compiled
 from training.networks.dsffnet import DSFFNet
+from training.networks.execution import GraphedTransfer, Precision, compiled
 
 # isort: split
-from literal_dsffnet import LiteralDSFFNet
+from tests.literal.dsffnet import LiteralDSFFNet
 
 PRECISIONS: tuple[Precision, ...] = ("float32", "tf32", "bfloat16")
 NARROW = {"encoder_widths": (16, 32, 256), "decoder_widths": (64, 256, 64)}

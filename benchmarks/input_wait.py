@@ -25,12 +25,12 @@ from torch import Tensor, nn
 from datagen.generate import generate
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
-from training.banks import Bank, open_bank, streamed_bank
-from training.batches import EdgeTable
-from training.layout import Layout
-from training.losses import pose_transfer_loss
+from training.data.batch import EdgeTable
+from training.data.triples import TripleOrder
+from training.data.vertex_bank import Bank, open_bank, streamed_bank
+from training.data.vertex_layout import Layout
 from training.networks.dsffnet import DSFFNet
-from training.triples import TripleOrder
+from training.objectives.losses import pose_transfer_loss
 
 GOAL = 0.02
 BATCH = 8

@@ -15,10 +15,10 @@ from statistics import median
 
 import torch
 
-from training.journal import Journal
 from training.networks import build_network
-from training.record import Server, begin_record
-from training.tracking import Mirror, publish
+from training.tracking.journal import Journal
+from training.tracking.mlflow_mirror import Mirror, publish
+from training.tracking.record import Server, begin_record
 
 
 class _Work:

@@ -25,16 +25,16 @@ from torch import Tensor, nn
 
 from benchmarks.peak_memory import forget_peak, peak_mebibytes
 from benchmarks.running import Meshes, forward, gradient, largest, random_meshes, relative, step, with_every_branch
-from training.acceleration import Precision
-from training.losses import pose_transfer_loss
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
+from training.networks.execution import Precision
 from training.networks.npt import NPT
+from training.objectives.losses import pose_transfer_loss
 
 # isort: split
-from literal_corenet3d import LiteralCoreNet3D
-from literal_dsffnet import LiteralDSFFNet
-from literal_npt import LiteralNPT
+from tests.literal.corenet3d import LiteralCoreNet3D
+from tests.literal.dsffnet import LiteralDSFFNet
+from tests.literal.npt import LiteralNPT
 
 
 class Case(NamedTuple):

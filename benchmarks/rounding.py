@@ -1,7 +1,8 @@
 """How far bfloat16 moves a trained network's outputs: ``python -m benchmarks.rounding RUN DATA.zarr [--triples 64]``.
 
 PMD between the outputs in bfloat16 and in float32, for unseen poses of new identities of a dataset (in the box of each
-mesh, see :func:`training.metrics.point_mesh_distance`), beside their PMD from the truth. The aim is a mean of 1e-6.
+mesh, see :func:`training.objectives.metrics.point_mesh_distance`), beside their PMD from the truth. The aim is a mean
+of 1e-6.
 """
 
 import argparse
@@ -10,10 +11,10 @@ from pathlib import Path
 import torch
 
 from datagen.store import open_dataset
-from training.acceleration import precision
-from training.batches import read_batch
-from training.inference import load_trained
-from training.metrics import point_mesh_distance
+from training.data.batch import read_batch
+from training.inference.predict import load_trained
+from training.networks.execution import precision
+from training.objectives.metrics import point_mesh_distance
 
 
 def main() -> None:

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from training.acceleration import Precision, autocast, precision, products
-from training.losses import pose_transfer_loss
-
-LITERAL_FORMS = str(Path(__file__).resolve().parents[1] / "tests" / "training")
-if LITERAL_FORMS not in sys.path:
-    sys.path.insert(0, LITERAL_FORMS)
+from training.networks.execution import Precision, autocast, precision, products
+from training.objectives.losses import pose_transfer_loss
 
 
 class Meshes(NamedTuple):

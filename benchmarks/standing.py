@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.animals import animal_files
 from datagen.bodies import load_body
-from datagen.mesh_files import read_mesh_file
+from datagen.characters.cc0_animals import animal_files
+from datagen.mesh.files import read_mesh_file
 from datagen.poses import draw_poses
 from datagen.recipe import PoseRecipe
-from datagen.recipe_bodies import AnnyBody, AnnyTopology, PhenotypeRanges
-from training.alignment import EVERY_AXES, UPRIGHT, Axes, Orientation, orientation
-from training.transfer import PoseTransfer
+from datagen.recipe.bodies import AnnyBody, AnnyTopology, PhenotypeRanges
+from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation, orientation
+from training.inference.transfer import PoseTransfer
 
 ANGLES = range(0, 90, 10)
 BODIES: tuple[tuple[AnnyTopology, int, int], ...] = (
@@ -77,7 +77,8 @@ def print_row(name: str, turned: str, found: Counter[str]) -> None:
 
 
 def said(way: Orientation, truth: Axes) -> str:
-    """What :func:`training.unlikeness.remarks` says of a mesh that is taken to stand as the training data."""
+    """What :func:`training.inference.domain_check.remarks` says of a mesh that is taken to stand as the training
+    data."""
     if way.fits(UPRIGHT):
         return "nothing"
     return "careful" if not way.is_certain else "right" if way.best == truth else "wrong"

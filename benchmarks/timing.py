@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import torch
 
-from training.acceleration import Precision, products
+from training.networks.execution import Precision, products
 
 
 def release(device: torch.device) -> None:

@@ -22,12 +22,13 @@ import numpy as np
 import torch
 from scipy.spatial import ConvexHull
 
-from datagen.mesh import Mesh, save_mesh
-from training.checkpoint import save_checkpoint
-from training.inference import network_from
-from training.recipe import TrainingRecipe
-from training.refinement import DEFAULT_WEIGHT
-from training.transfer import PoseTransfer
+from datagen.mesh.files import save_mesh
+from datagen.mesh.geometry import Mesh
+from training.checkpoints.checkpoint import save_checkpoint
+from training.inference.predict import network_from
+from training.inference.refinement import DEFAULT_WEIGHT
+from training.inference.transfer import PoseTransfer
+from training.recipes.training import TrainingRecipe
 
 
 def main() -> None:
@@ -89,7 +90,7 @@ def median(work: Callable[[], object], repeats: int = 10) -> float:
 def whole(run: Path, folder: Path, extra: tuple[str, ...], threads: int) -> float:
     """Seconds of the command, from nothing to a file."""
     words = ["--model", run, folder / "source.obj", folder / "target.obj", "-o", folder / "out.obj", *extra]
-    command = [sys.executable, "-m", "workflows.cli", "transfer", *map(str, words)]
+    command = [sys.executable, "-m", "workflows", "transfer", *map(str, words)]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
 
     def work() -> None:

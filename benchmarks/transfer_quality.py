@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from datagen.mesh import Mesh, bounding_box, edges_of
+from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from training import metrics
-from training.placing import scale_of
-from training.refinement import Refinement
-from training.transfer import PoseTransfer
+from training.inference.placement import scale_of
+from training.inference.refinement import Refinement
+from training.inference.transfer import PoseTransfer
+from training.objectives import metrics
 
 WEIGHTS = (0.0, 0.5, 2.0, 6.0, 20.0, 60.0)
 

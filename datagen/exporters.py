@@ -10,10 +10,12 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import DatasetError, RecipeError, StorageError
+from datagen.common.errors import DatasetError, RecipeError, StorageError
+from datagen.common.files import write_atomically
 from datagen.grid import POSE_TYPES
-from datagen.mesh import Mesh, save_mesh, write_atomically
-from datagen.obj import face_lines, vertex_lines
+from datagen.mesh.files import save_mesh
+from datagen.mesh.formats.obj_fast import face_lines, vertex_lines
+from datagen.mesh.geometry import Mesh
 from datagen.store import Dataset
 
 ExportLayout = Literal["npt-obj", "npt-ply", "obj", "ply", "glb"]

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from datagen.bodies import load_body, require_joints
-from datagen.errors import BodyError, ClusterError, DatasetError, RecipeError
+from datagen.common.errors import BodyError, ClusterError, DatasetError, RecipeError
 from datagen.grid import Grid, Shard
 from datagen.importers import require_files
-from datagen.mesh import bounds
-from datagen.places import remove, require_ours, writing_alone
+from datagen.mesh.geometry import bounds
 from datagen.poses import draw_poses, load_poses
 from datagen.recipe import DatasetRecipe, Growth
-from datagen.recipe_text import faults_text
+from datagen.recipe.text import faults_text
 from datagen.sizes import require_memory
 from datagen.store.attributes import assets_of, check_same_assets
+from datagen.store.location import remove, require_ours, writing_alone
 from datagen.store.reader import Dataset, open_dataset
 from datagen.store.schema import ManifestRow, check_extent, open_group, shard_path, stored_recipe
 from datagen.store.verify import Fault, find_faults

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.random import Stream, generator
+from datagen.common.seeding import Stream, generator
 from datagen.recipe import DatasetRecipe, Growth
 
 PoseType = Literal["seen", "unseen"]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.errors import BodyError, UnsafeFileError
-from datagen.files import read_bounded
+from datagen.bodies.imported_layouts import Cell, FoundMeshes, Layout, find_meshes
+from datagen.common.errors import BodyError, UnsafeFileError
+from datagen.common.files import read_bounded
 from datagen.grid import POSE_TYPES, Grid, PoseType
-from datagen.layouts import Cell, FoundMeshes, Layout, find_meshes
 from datagen.recipe import DatasetRecipe, ImportedBody, MixedBody
 
 _LIST_LIMIT = 2**26  # bytes; a million triples have some 40 MB
@@ -38,7 +38,7 @@ def found_recipe(layout: Layout, path: str | Path, **options: Any) -> DatasetRec
     Raises
     ------
     BodyError
-        See :func:`datagen.layouts.find_meshes`; or an identity lacks a pose that others have.
+        See :func:`datagen.bodies.imported_layouts.find_meshes`; or an identity lacks a pose that others have.
     """
     body = ImportedBody.model_validate({"layout": layout, "path": str(Path(path).resolve()), **options})
     meshes = find_meshes(body)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.bodies import load_body
-from datagen.errors import DsffnetError, RecipeError, StorageError
+from datagen.common.errors import DsffnetError, RecipeError, StorageError
+from datagen.common.resources import bytes_text, free_disk, free_memory
+from datagen.common.seeding import Stream, generator
 from datagen.grid import Grid
-from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
-from datagen.resources import bytes_text, free_disk, free_memory
 
 _VERTEX = 12
 """Bytes of a vertex: three float32."""

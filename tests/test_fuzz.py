@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.errors import DatasetError
+from datagen.common.errors import DatasetError
 from tests.fuzz import watch
 from tests.fuzz.runner import Runner, Verdict
 from tests.fuzz.specimens import Specimens

@@ -19,26 +19,27 @@ if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its
 from contextlib import ExitStack
 from functools import partial
 
-from datagen.files import read_text_within
+from datagen.common.files import read_text_within
 from datagen.store import open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
-from training.record import has_record, read_record, update_record
-from training.report import NAMES, report_is_current, workflow_report
-from training.tracking import Mirror
-from workflows.cluster import require_reachable
-from workflows.commands import print_text
-from workflows.console import (
+from training.reports.report import NAMES, report_is_current, workflow_report
+from training.tracking.mlflow_mirror import Mirror
+from training.tracking.record import has_record, read_record, update_record
+from workflows.pipeline.console import (
     add_local_option,
     alone_in,
     closing_words,
     guarded,
+    print_text,
     server_of,
     start_over,
     workflow_parser,
 )
-from workflows.data_size import announce_size
-from workflows.pipeline import (
+from workflows.pipeline.data_size import announce_size
+from workflows.pipeline.ray_cluster import require_reachable
+from workflows.pipeline.stage import Stage, once, refuse_other_kind, run_stage
+from workflows.pipeline.stage_functions import (
     check_run_accepts,
     evaluate_stage,
     generate_stage,
@@ -48,9 +49,8 @@ from workflows.pipeline import (
     recorded,
     train_stage,
 )
-from workflows.recipe import WorkflowRecipe, load_recipe, save_recipe
-from workflows.stages import Stage, once, refuse_other_kind, run_stage
-from workflows.tasks import TaskRunner
+from workflows.pipeline.tasks import TaskRunner
+from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
 
 
 def main(arguments: list[str] | None = None) -> None:

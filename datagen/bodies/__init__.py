@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.assets import Asset
-from datagen.errors import BodyError
+from datagen.common.assets import Asset
+from datagen.common.errors import BodyError
 from datagen.poses import Poses, PoseSource
 from datagen.recipe import Body
 
@@ -41,9 +41,9 @@ class BodyModel(Protocol):
 
 
 FAMILIES = {
-    "anny": "datagen.bodies.anny:AnnyModel",
-    "smpl": "datagen.bodies.smpl:SmplModel",
-    "smal": "datagen.bodies.smal:SmalModel",
+    "anny": "datagen.bodies.anny.model:AnnyModel",
+    "smpl": "datagen.bodies.smpl_family.smpl:SmplModel",
+    "smal": "datagen.bodies.smpl_family.smal:SmalModel",
     "rigged": "datagen.bodies.rigged:RiggedModel",
     "imported": "datagen.bodies.imported:ImportedModel",
     "mixed": "datagen.bodies.mixed:MixedModel",

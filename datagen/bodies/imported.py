@@ -2,7 +2,7 @@
 
 So an import is a generation like any other: shards, workers, repair and remote stores are the same, and as long as the
 folder is there and unchanged, so are the bytes. Identity i is the i-th of the files' identities. Poses come from the
-source ``found``, whose one pseudo-joint carries the pose's number (:data:`datagen.poses.files.NUMBER`).
+source ``found``, whose one pseudo-joint carries the pose's number (:data:`datagen.poses.pose_files.NUMBER`).
 """
 
 import hashlib
@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.assets import Asset, file_asset
-from datagen.errors import BodyError, MeshError
-from datagen.files import read_bounded
-from datagen.layouts import FoundMeshes, find_meshes
-from datagen.mesh import Mesh, load_mesh
-from datagen.mesh_limits import BYTE_LIMIT
+from datagen.bodies.imported_layouts import FoundMeshes, find_meshes
+from datagen.common.assets import Asset, file_asset
+from datagen.common.errors import BodyError, MeshError
+from datagen.common.files import read_bounded
+from datagen.mesh.files import load_mesh
+from datagen.mesh.geometry import Mesh
+from datagen.mesh.limits import BYTE_LIMIT
 from datagen.poses import Poses
-from datagen.poses.files import NUMBER
+from datagen.poses.pose_files import NUMBER
 from datagen.recipe import Axis, ImportedBody
 
 _LICENCE = "as the files' owner states"

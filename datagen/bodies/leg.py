@@ -7,8 +7,8 @@ family is added. Identity: length, thigh and ankle radius, knee height. It obeys
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.assets import Asset
 from datagen.bodies.skinning import Rest, skin
+from datagen.common.assets import Asset
 from datagen.poses import JOINTS, Poses
 from datagen.recipe import LegBody
 

@@ -5,8 +5,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.assets import Asset
 from datagen.bodies import BodyModel, load_body
+from datagen.common.assets import Asset
 from datagen.poses import Poses
 from datagen.recipe import MixedBody
 

@@ -1,19 +1,19 @@
 """Rigged characters of any make: twelve CC0 animals, or a folder of glTF files whose joints share names.
 
 An identity is a character with proportions of its own: torso, neck, head, limbs and tail are longer or shorter, thicker
-or thinner than their maker made them (:mod:`datagen.bodies.stretching`).
+or thinner than their maker made them (:mod:`datagen.bodies.proportions`).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.bodies.proportions import Scales, Stretchable
 from datagen.bodies.skinning import Rest, skin
-from datagen.bodies.stretching import Scales, Stretchable
-from datagen.characters import load_characters, shared_joints
-from datagen.errors import BodyError
+from datagen.characters.character import load_characters, shared_joints
+from datagen.characters.weld import volume
+from datagen.common.errors import BodyError
 from datagen.poses import Poses
 from datagen.recipe import RiggedBody
-from datagen.surfaces import volume
 
 _FACTORS = {
     "torso length": "torso", "torso girth": "torso", "neck length": "neck", "neck girth": "neck", "head size": "head",

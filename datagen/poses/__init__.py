@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from datagen.assets import Asset
+from datagen.common.assets import Asset
 from datagen.poses.skeletons import JOINTS, PARENTS
 from datagen.recipe import PoseRecipe
 
@@ -78,12 +78,12 @@ class PoseSource(Protocol):
 
 
 SOURCES = {
-    "npt": "datagen.poses.ranges:NptSource",
-    "ranges": "datagen.poses.ranges:RangeSource",
-    "found": "datagen.poses.files:FoundSource",
-    "clips": "datagen.poses.clips:ClipSource",
+    "npt": "datagen.poses.joint_ranges:NptSource",
+    "ranges": "datagen.poses.joint_ranges:RangeSource",
+    "found": "datagen.poses.pose_files:FoundSource",
+    "clips": "datagen.poses.animation_clips:ClipSource",
     "amass": "datagen.poses.amass:AmassSource",
-    "file": "datagen.poses.files:FileSource",
+    "file": "datagen.poses.pose_files:FileSource",
 }
 
 

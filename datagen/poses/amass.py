@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from datagen.assets import Asset
-from datagen.errors import RecipeError
-from datagen.poses.motions import JOINTS_OF_WIDTH, Motion, find_motions, read_frames
+from datagen.common.assets import Asset
+from datagen.common.errors import RecipeError
+from datagen.common.seeding import Stream, generator
+from datagen.poses.amass_files import JOINTS_OF_WIDTH, Motion, find_motions, read_frames
 from datagen.poses.skeletons import JOINTS, PARENTS
-from datagen.random import Stream, generator
 from datagen.recipe import AmassPoses, PoseRecipe
 
 _TO_Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])

@@ -10,7 +10,7 @@ import zarr
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
-from datagen.errors import UnsafeFileError, reason_of
+from datagen.common.errors import UnsafeFileError, reason_of
 from datagen.store.codec import LARGEST_CHUNK, require_plausible
 from datagen.store.schema import identity_name, parse_json, read_bytes, vertices_path
 

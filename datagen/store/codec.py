@@ -17,6 +17,8 @@ import numpy as np
 from numcodecs import Blosc
 from numpy.typing import NDArray
 
+from datagen.common.errors import ShardDamage
+
 # Blosc's threads write their blocks in the order in which they finish; one thread makes the bytes reproducible.
 numcodecs.blosc.use_threads = False
 
@@ -26,10 +28,6 @@ _BLOSC_HEADER = struct.Struct("<4B3I")  # two versions, flags, typesize; decoded
 LARGEST_CHUNK = 2**31 - 17
 """Bytes that Blosc can encode as one chunk; no other array is larger either."""
 _COMPRESSES, _SLACK = 1000, 2**24
-
-
-class ShardDamage(ValueError):
-    """The bytes of a shard are not what was written."""
 
 
 @dataclass(frozen=True)

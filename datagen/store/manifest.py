@@ -13,7 +13,7 @@ from typing import Any
 import zarr
 from pydantic import TypeAdapter
 
-from datagen.errors import UnsafeFileError, reason_of
+from datagen.common.errors import UnsafeFileError, reason_of
 from datagen.grid import Grid
 from datagen.store.object_names import is_member, require_member
 from datagen.store.schema import (

@@ -4,7 +4,7 @@ import re
 
 from zarr.core.buffer import Buffer
 
-from datagen.errors import DatasetError, UnsafeFileError
+from datagen.common.errors import DatasetError, UnsafeFileError
 from datagen.store.codec import LARGEST_CHUNK
 
 _NUMBER = "[0-9]{1,9}"

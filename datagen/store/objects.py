@@ -14,8 +14,8 @@ from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteReque
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from datagen.errors import DatasetError, UnsafeFileError
-from datagen.files import open_regular, read_bounded, resolve_within
+from datagen.common.errors import DatasetError, UnsafeFileError
+from datagen.common.files import open_regular, read_bounded, resolve_within
 from datagen.store.object_names import is_leftover, limit_of, require_member, require_short
 from datagen.store.remote_objects import S3_OPTIONS, RemoteObjects
 

@@ -12,14 +12,14 @@ import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import ByteRequest, RangeByteRequest, SuffixByteRequest
 
-from datagen.errors import DatasetError, UnsafeFileError, reason_of
+from datagen.common.errors import DatasetError, ShardDamage, UnsafeFileError, reason_of
 from datagen.grid import Grid, PoseType, Split
 from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, read_array, read_topology, read_vertex_count
-from datagen.store.codec import ShardCodec, ShardDamage, require_plausible
+from datagen.store.attributes import attributes_fault
+from datagen.store.codec import ShardCodec, require_plausible
 from datagen.store.manifest import Manifest, covers, is_sealed, read_manifest
-from datagen.store.root_attributes import attributes_fault
 from datagen.store.schema import (
     ManifestRow,
     attributes_of,

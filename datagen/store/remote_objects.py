@@ -13,7 +13,7 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore
 
-from datagen.errors import StorageError, UnsafeFileError, reason_of
+from datagen.common.errors import StorageError, UnsafeFileError, reason_of
 from datagen.store.object_names import is_leftover, limit_of, require_member, require_short
 
 log = logging.getLogger(__name__)

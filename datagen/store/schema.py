@@ -23,7 +23,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 from zarr.errors import ContainsGroupError
 
-from datagen.errors import DatasetError, DsffnetError, reason_of
+from datagen.common.errors import DatasetError, DsffnetError, NoDataset, reason_of
 from datagen.grid import Grid, Shard, Split
 from datagen.recipe import DatasetRecipe
 from datagen.store.codec import ShardCodec
@@ -37,10 +37,6 @@ _MOST_TRIPLES = 10_000_000
 _MOST_STEPS = 1000
 _BYTES_OF_IDENTITY, _BYTES_OF_SHARD = 700, 500
 """Of the manifest, no less than it takes."""
-
-
-class NoDataset(DatasetError):
-    """There is nothing at that place."""
 
 
 @dataclass(frozen=True, order=True)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import zarr
 
-from datagen.errors import DatasetError, UnsafeFileError, reason_of
+from datagen.common.errors import DatasetError, UnsafeFileError, reason_of
 from datagen.grid import POSE_TYPES, SPLITS, Grid, Shard
 from datagen.recipe import DatasetRecipe, MixedBody
 from datagen.store.arrays import ArrayDamage, read_array
+from datagen.store.attributes import attributes_fault
 from datagen.store.manifest import Manifest, changed_objects, covers, is_sealed, read_manifest
 from datagen.store.reader import Dataset
-from datagen.store.root_attributes import attributes_fault
 from datagen.store.schema import (
     ManifestRow,
     attributes_of,

@@ -16,20 +16,19 @@ from zarr.codecs import ZstdCodec
 from zarr.errors import ContainsArrayError
 
 from datagen.bodies import BodyModel
-from datagen.errors import DatasetError, UnsafeFileError, storage_errors
+from datagen.common.errors import DatasetError, NoDataset, ShardDamage, UnsafeFileError, storage_errors
+from datagen.common.seeding import Stream, generator
 from datagen.grid import Grid, Shard
 from datagen.importers import evaluation_lists
-from datagen.mesh import bounds
+from datagen.mesh.geometry import bounds
 from datagen.poses import draw_poses
-from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, read_array, read_vertex_count, read_vertices_shape
 from datagen.store.attributes import assets_of, check_same_assets, check_same_recipe, provenance, stated
-from datagen.store.codec import ShardCodec, ShardDamage
+from datagen.store.codec import ShardCodec
 from datagen.store.manifest import Manifest, commit, read_manifest
 from datagen.store.schema import (
     ManifestRow,
-    NoDataset,
     attributes_of,
     check_extent,
     codec_of,

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from datagen.errors import DatasetError
+from datagen.common.errors import DatasetError
 from datagen.generate import append, generate, inline, repair
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
@@ -23,9 +23,9 @@ from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
 from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset, tiny_training
-from training.recipe import EvaluationRecipe
-from workflows import pipeline
-from workflows.pipeline import evaluate_stage, train_stage
+from training.recipes.training import EvaluationRecipe
+from workflows.pipeline import stage_functions as pipeline
+from workflows.pipeline.stage_functions import evaluate_stage, train_stage
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
 ROOT = Path(__file__).parents[2]

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.errors import DatasetError, RecipeError, StorageError
+from datagen.common.errors import DatasetError, RecipeError, StorageError
 from datagen.exporters import ExportLayout, export_dataset
 from datagen.generate import generate
 from datagen.importers import found_recipe, listed_triples
-from datagen.mesh import load_mesh
+from datagen.mesh.files import load_mesh
 from datagen.recipe import ImportedBody
 from datagen.store import open_dataset
 from tests.support.disk import small_disk

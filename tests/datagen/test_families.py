@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.errors import BodyError, DatasetError
+from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import append, generate, repair
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset

@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from datagen import generate as generation
-from datagen.errors import BodyError, DatasetError
+from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import generate, inline, make_shard, prepare
 from datagen.grid import Grid
-from datagen.places import writing_alone
 from datagen.store import open_dataset
+from datagen.store.location import writing_alone
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
 from tests.support.recipes import tiny_dataset

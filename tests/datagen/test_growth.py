@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.errors import DatasetError
+from datagen.common.errors import DatasetError
 from datagen.generate import append, ensure_shard, generate, inline
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
@@ -111,8 +111,8 @@ def test_the_recipe_it_was_first_made_by_does_not_shrink_it(spoilable: Path) -> 
 
 def test_training_sees_appended_identities_and_poses(spoilable: Path) -> None:
     """The bank and the order of triples go by pose number, also where a pose's row is another number."""
-    from training.banks import open_bank
-    from training.triples import TripleOrder
+    from training.data.triples import TripleOrder
+    from training.data.vertex_bank import open_bank
 
     grown = append(str(spoilable), training=4, seen=9)
     identities = grown.identities("training")

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.errors import BodyError, RecipeError
+from datagen.bodies.imported_layouts import find_meshes
+from datagen.common.errors import BodyError, RecipeError
 from datagen.generate import generate
 from datagen.importers import found_recipe, listed_triples, read_test_list, require_files
-from datagen.layouts import find_meshes
 from datagen.recipe import DatasetRecipe, ImportedBody
 from tests.support.meshes import faust_folder, garment_folder, npt_folder, tetrahedron
 

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datagen import sizes
-from datagen.errors import DatasetError, OutOfMemory, RecipeError, StorageError
+from datagen.common.errors import DatasetError, OutOfMemory, RecipeError, StorageError
+from datagen.common.resources import bytes_text, memory_errors, ran_out_of_memory
 from datagen.generate import append, generate
 from datagen.grid import Grid
 from datagen.recipe import AnnyBody, DatasetRecipe, MixedBody
-from datagen.resources import bytes_text, memory_errors, ran_out_of_memory
 from datagen.sizes import duration_text, require_disk, require_memory, size_of
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset

@@ -17,7 +17,7 @@ import jsonschema
 import pytest
 from composefile import RAY_SERVICES, ROOT, Service
 
-from workflows.cli import _parser
+from workflows.cli.main import _parser
 
 SERVICES = composefile.services()
 PROJECT_SERVICES = ("mlflow", *RAY_SERVICES)

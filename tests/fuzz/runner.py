@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from datagen.errors import DsffnetError
+from datagen.common.errors import DsffnetError
 from tests.fuzz.mutators import mutate, reseal
 from tests.fuzz.specimens import Specimens
 from tests.fuzz.structures import SECRET, SECRET_NAME

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from datagen.generate import generate
-from datagen.mesh import FORMATS, Mesh, save_mesh
-from datagen.mesh_files import read_mesh_file, write_posed
+from datagen.mesh.files import read_mesh_file, save_mesh, write_posed
+from datagen.mesh.formats import FORMATS
+from datagen.mesh.geometry import Mesh
 from datagen.poses import PARENTS, Poses
-from datagen.poses.files import write_pose_file
+from datagen.poses.pose_files import write_pose_file
 from datagen.poses.skeletons import JOINTS
 from datagen.store import open_dataset
 from tests.support.models import random_model, save_npz, save_pickle
@@ -116,9 +117,9 @@ def _make_dataset(folder: Path, specimens: Specimens) -> None:
 
 def _make_run(folder: Path, specimens: Specimens) -> None:
     """A run of four steps with two checkpoints, its record and its origin; half of it; two meshes to transfer with."""
-    from training.record import begin_record, end_record
-    from training.trainer import train
-    from workflows.pipeline import write_run_head
+    from training.engine.trainer import train
+    from training.tracking.record import begin_record, end_record
+    from workflows.pipeline.stage_functions import write_run_head
 
     recipe = tiny_training(steps=4, checkpoint_every=2, evaluate_every=2, average=0.9)
     run, dataset = folder / "run", open_dataset(str(specimens.dataset))
@@ -141,9 +142,9 @@ def _make_weights(folder: Path, specimens: Specimens) -> None:
     """Exported weights with their manifest, the same without one, and a state_dict as the authors publish theirs."""
     import torch
 
-    from training.checkpoint import export_weights, require_checkpoint
-    from training.networks.conversion import to_released_npt
+    from training.checkpoints.checkpoint import export_weights, require_checkpoint
     from training.networks.npt import NPT
+    from training.networks.released_weights import to_released_npt
 
     export_weights(require_checkpoint(specimens.folder("run") / "run"), folder / "weights")
     (folder / "weights" / "more").mkdir()
@@ -154,10 +155,10 @@ def _make_weights(folder: Path, specimens: Specimens) -> None:
 
 def _make_workflow(folder: Path, specimens: Specimens) -> None:
     """A workflow's folder: records, marks of its stages, what was sent to MLflow, journals, rows, a figure."""
-    from training.journal import Journal
-    from training.outbox import note_sent
-    from training.record import begin_record, end_record, update_record
-    from training.rows import Row, write_rows
+    from training.evaluation.results import Row, write_rows
+    from training.tracking.journal import Journal
+    from training.tracking.mirror_state import note_sent
+    from training.tracking.record import begin_record, end_record, update_record
 
     root = folder / "workflow"
     begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
@@ -182,7 +183,7 @@ def _make_workflow(folder: Path, specimens: Specimens) -> None:
 def _make_recipe(folder: Path, specimens: Specimens) -> None:
     import yaml
 
-    from workflows.recipe import load_recipe
+    from workflows.recipe.loader import load_recipe
 
     for name in ("quickstart", "smoke", "smpl-paper"):
         recipe = load_recipe(name).model_dump(mode="json")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workflows.cli import main
+from workflows.cli.main import main
 
 Read = Callable[[Path], str | None]
 """Reads the tree at a path; the folder that it lies in is the current one, and what is written goes there."""
@@ -87,16 +87,16 @@ def _verified(tree: Path) -> str:
 
 
 def _weights(tree: Path) -> str:
-    from training.checkpoint import require_checkpoint
+    from training.checkpoints.checkpoint import require_checkpoint
 
     return _digest(sorted((name, value.tolist()) for name, value in require_checkpoint(tree).weights().items()))
 
 
 def _network_of_run(tree: Path) -> None:
-    from training.inference import load_trained
-    from training.unlikeness import seen_by
-    from workflows.evaluated import evaluated
-    from workflows.kinds import own_recipe
+    from training.inference.domain_check import seen_by
+    from training.inference.predict import load_trained
+    from workflows.pipeline.weights_argument import evaluated
+    from workflows.studies.mesh_kinds import own_recipe
 
     for which in ("result", "best", 2):
         found = evaluated(tree, which)  # type: ignore[arg-type]
@@ -108,14 +108,14 @@ def _network_of_run(tree: Path) -> None:
 def _resume(tree: Path) -> None:
     """Training goes on by two steps, on the dataset that it was trained on."""
     from tests.support.recipes import tiny_training
-    from training.trainer import train
+    from training.engine.trainer import train
 
     train(tiny_training(steps=4, checkpoint_every=2, evaluate_every=2, average=0.9), data="leg.zarr", run=tree)
 
 
 def _state_of_run(tree: Path) -> None:
-    from training.checkpoint import require_checkpoint
-    from training.earlier import recipe_of, state_of
+    from training.checkpoints.checkpoint import require_checkpoint
+    from training.checkpoints.compat import recipe_of, state_of
 
     checkpoint = require_checkpoint(tree)
     recipe_of(checkpoint)
@@ -124,35 +124,35 @@ def _state_of_run(tree: Path) -> None:
 
 def _learned(tree: Path) -> None:
     """What figures and reports read of a run."""
-    from training.journal import read_journal
-    from training.recipe_file import recipe_in
+    from training.recipes.files import recipe_in
+    from training.tracking.journal import read_journal
 
     read_journal(tree / "metrics.jsonl")
     recipe_in(tree / "recipe.yaml")
 
 
 def _recipe_in(tree: Path) -> None:
-    from training.recipe_file import recipe_in
+    from training.recipes.files import recipe_in
 
     recipe_in(tree)
 
 
 def _network(tree: Path) -> None:
-    from training.inference import load_trained
+    from training.inference.predict import load_trained
 
     load_trained(tree)
 
 
 def _released(tree: Path) -> None:
-    from training.networks.conversion import load_released_npt
+    from training.networks.released_weights import load_released_npt
 
     load_released_npt(tree, variant="maxpool")
 
 
 def _records(tree: Path) -> None:
     """As MLflow's mirror does, without a server."""
-    from training.outbox import read_sent, unsent_artifacts, unsent_rows
-    from training.record import find_records, read_record
+    from training.tracking.mirror_state import read_sent, unsent_artifacts, unsent_rows
+    from training.tracking.record import find_records, read_record
 
     for folder in find_records(tree):
         record = read_record(folder)
@@ -166,7 +166,7 @@ def _synced(tree: Path) -> None:
 
 
 def _stages(tree: Path) -> None:
-    from workflows.stages import Stage, refuse_other_kind, run_stage
+    from workflows.pipeline.stage import Stage, refuse_other_kind, run_stage
 
     refuse_other_kind(tree, "workflow")
     stage = Stage("generate", depends_on="data", intact=lambda: True, work=lambda: None)
@@ -178,7 +178,7 @@ def _stages(tree: Path) -> None:
 
 def _began_again(tree: Path) -> None:
     """The same command goes on with a run's record, whatever it finds."""
-    from training.record import begin_record, end_record, read_record, update_record
+    from training.tracking.record import begin_record, end_record, read_record, update_record
 
     begin_record(tree / "run", name="train", kind="train", parent=tree, parameters={})
     update_record(tree / "run", artifacts=["figures"])
@@ -187,13 +187,13 @@ def _began_again(tree: Path) -> None:
 
 
 def _kept_rows(tree: Path) -> None:
-    from training.rows import read_piece
+    from training.evaluation.results import read_piece
 
     read_piece(tree / "run" / "rows.csv", [("DSFFNet", "seen", 3)] * 3)
 
 
 def _mesh(tree: Path) -> None:
-    from datagen.mesh_files import read_mesh_file, write_posed
+    from datagen.mesh.files import read_mesh_file, write_posed
 
     file = _mesh_in(tree)
     read = read_mesh_file(file)
@@ -202,7 +202,7 @@ def _mesh(tree: Path) -> None:
 
 
 def _plain_mesh(tree: Path) -> None:
-    from datagen.mesh import load_mesh
+    from datagen.mesh.files import load_mesh
 
     load_mesh(tree)
 
@@ -212,15 +212,15 @@ def _mesh_in(tree: Path) -> Path:
 
 
 def _sequence(tree: Path) -> None:
-    from datagen.mesh_files import read_mesh_file
-    from datagen.mesh_sequences import frames_of
+    from datagen.mesh.files import read_mesh_file
+    from datagen.mesh.sequences import frames_of
 
     for frame in frames_of(tree):
         read_mesh_file(frame)
 
 
 def _character(tree: Path) -> None:
-    from datagen.characters import load_character
+    from datagen.characters.character import load_character
 
     file = tree / tree.name.replace(" ", ".")
     with warnings.catch_warnings():
@@ -231,20 +231,20 @@ def _character(tree: Path) -> None:
 
 
 def _poses(tree: Path) -> None:
-    from datagen.poses.files import read_pose_file
+    from datagen.poses.pose_files import read_pose_file
 
     read_pose_file(tree)
 
 
 def _motion(tree: Path) -> None:
-    from datagen.poses.motions import find_motions, read_frames
+    from datagen.poses.amass_files import find_motions, read_frames
 
     for motion in find_motions(str(tree)):
         read_frames(motion)
 
 
 def _model(tree: Path) -> None:
-    from datagen.model_files import read_model
+    from datagen.bodies.smpl_family.model_file import read_model
 
     read_model(tree)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.standins import write_standin
+from datagen.bodies.standins.smpl_format import write_standin
 from tests.support.meshes import npt_folder
 from tests.support.rigged_files import BOXES, JOINTS, Rig, about
 

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 def command(
     *arguments: object, script: str = "dsffnet", folder: Path = ROOT, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    start = ["-m", "workflows.cli"] if script == "dsffnet" else [str(ROOT / "workflows" / script)]
+    start = ["-m", "workflows"] if script == "dsffnet" else [str(ROOT / "workflows" / script)]
     return subprocess.run(
         [sys.executable, *start, *map(str, arguments)],
         capture_output=True,

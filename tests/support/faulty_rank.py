@@ -1,9 +1,10 @@
-"""A rank whose loss becomes NaN: FAULT_RANK and FAULT_STEP say whose and when. Started like training.launch."""
+"""A rank whose loss becomes NaN: FAULT_RANK and FAULT_STEP say whose and when. Started like training.engine.launch."""
 
 import os
 from typing import Any
 
-from training import launch, learner
+from training.engine import launch
+from training.engine import train_step as learner
 
 _real = learner.transfer_loss
 _calls = 0

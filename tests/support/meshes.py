@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh import Mesh, save_mesh
+from datagen.mesh.files import save_mesh
+from datagen.mesh.geometry import Mesh
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 

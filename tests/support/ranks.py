@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from training.recipe import TrainingRecipe
+from training.recipes.training import TrainingRecipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,7 +26,7 @@ def start_ranks(
     data: str,
     run: Path,
     count: int,
-    module: str = "training.launch",
+    module: str = "training",
     log: Path | None = None,
 ) -> list[subprocess.Popen[str]]:
     """Start ``count`` ranks of ``python -m module RECIPE DATA RUN``."""

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from datagen.animals import animal_files
-from datagen.errors import DsffnetError
+from datagen.characters.cc0_animals import animal_files
+from datagen.common.errors import DsffnetError
 
 
 def require_animals() -> Path:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from datagen.recipe import DatasetRecipe
-from training.recipe import TrainingRecipe
+from training.recipes.training import TrainingRecipe
 
 
 def tiny_dataset(**changes: Any) -> DatasetRecipe:

@@ -10,11 +10,11 @@ import yaml
 
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import tiny_training
-from training.evaluation import NO_OPS, POSE_TYPES, Row, write_rows
-from training.record import begin_record, end_record, update_record
-from training.showcase import draw_training_curve
-from training.tables import report
-from training.trainer import train
+from training.engine.trainer import train
+from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, write_rows
+from training.evaluation.tables import report
+from training.reports.examples import draw_training_curve
+from training.tracking.record import begin_record, end_record, update_record
 
 
 def rows_on(dataset: Dataset) -> list[Row]:

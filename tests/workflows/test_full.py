@@ -18,10 +18,10 @@ from datagen.generate import generate
 from datagen.store import open_dataset
 from tests.support.disk import grow, small_disk
 from tests.support.files import tree_hash
-from training.checkpoint import require_checkpoint
-from training.journal import read_journal
-from training.record import read_record
-from workflows.recipe import load_recipe
+from training.checkpoints.checkpoint import require_checkpoint
+from training.tracking.journal import read_journal
+from training.tracking.record import read_record
+from workflows.recipe.loader import load_recipe
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(400)]
 ROOT = Path(__file__).parents[2]
@@ -164,7 +164,7 @@ def test_mlflow_shows_one_parent_three_children_and_a_loadable_model(undisturbed
 
 def test_evaluating_on_other_data_leaves_the_workflow_as_it_was(undisturbed: Path, tmp_path: Path) -> None:
     def dsffnet(*arguments: object) -> None:
-        command = [sys.executable, "-m", "workflows.cli", *map(str, arguments)]
+        command = [sys.executable, "-m", "workflows", *map(str, arguments)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False)
         assert done.returncode == 0, done.stderr
 
@@ -306,7 +306,7 @@ def test_tracking_server_down_costs_nothing_but_the_exit_status(tmp_path: Path) 
     sync = [
         sys.executable,
         "-m",
-        "workflows.cli",
+        "workflows",
         "sync",
         str(out),
         "--tracking-uri",

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
-from training.networks.correspondence import transport_matrix, warp
-from training.networks.elain import SLOPE, Generator
-from training.networks.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
-from training.networks.shapes import check_pair
+from training.networks.layers.elain import SLOPE, Generator
+from training.networks.layers.input_checks import check_pair
+from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
+from training.networks.layers.optimal_transport import transport_matrix, warp
 
 INITIAL_GAIN = 0.02
 """Gain of the initial Xavier normal weights (released code)."""

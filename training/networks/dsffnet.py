@@ -7,8 +7,9 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.encoder import PoseEncoder, centred_features, normalised_linear
-from training.networks.modulation import (
+from training.networks.layers.autocast_centering import centred_for_autocast
+from training.networks.layers.input_checks import check_vertices
+from training.networks.layers.modulation import (
     FFAdaIN,
     full_precision,
     homogeneous,
@@ -17,8 +18,7 @@ from training.networks.modulation import (
     rounded_modulated_relu,
     with_zero_gradients,
 )
-from training.networks.rounding import centred_for_autocast
-from training.networks.shapes import check_vertices
+from training.networks.layers.pose_encoder import PoseEncoder, centred_features, normalised_linear
 
 
 class DSFFNet(nn.Module):

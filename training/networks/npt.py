@@ -7,8 +7,8 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.encoder import PoseEncoder
-from training.networks.modulation import (
+from training.networks.layers.input_checks import check_vertices
+from training.networks.layers.modulation import (
     affine_map,
     full_precision,
     homogeneous,
@@ -17,7 +17,7 @@ from training.networks.modulation import (
     posed_map,
     with_zero_gradients,
 )
-from training.networks.shapes import check_vertices
+from training.networks.layers.pose_encoder import PoseEncoder
 
 WEIGHT_DEVIATION = 0.02
 """Standard deviation of the initial weights (NPT, released ``utils.weights_init``)."""

@@ -12,11 +12,11 @@ import torch
 from scipy.stats import ks_2samp
 
 from datagen.bodies import load_body
-from datagen.bodies.anny import AnnyModel, _alone_with_whole_files
-from datagen.bodies.anny_shape import variation_shares
-from datagen.errors import BodyError
+from datagen.bodies.anny.model import AnnyModel, _alone_with_whole_files
+from datagen.bodies.anny.shape import variation_shares
+from datagen.common.errors import BodyError
+from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
-from datagen.random import Stream, generator
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe
 
 ALL_AGES = PhenotypeRanges(age=(0.0, 1.0))
@@ -247,7 +247,7 @@ class TestCache:
     def test_caches_built_on_one_and_two_threads_hold_the_same_body(self, tmp_path: Path) -> None:
         script = (
             "import sys, torch; torch.set_num_threads(int(sys.argv[1]))\n"
-            "from datagen.bodies.anny import AnnyModel\n"
+            "from datagen.bodies.anny.model import AnnyModel\n"
             "from datagen.recipe import AnnyBody\n"
             "points = AnnyModel(AnnyBody(topology='notoes_collapse3pc'))._shape.points((.3, .6, .2, .7, .4, .9))\n"
             "import hashlib; print(hashlib.sha256(points.tobytes()).hexdigest())\n"

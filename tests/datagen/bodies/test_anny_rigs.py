@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from datagen.bodies import BodyModel, load_body
-from datagen.bodies.anny_rigs import Rig, carriers, parents_first, t_pose_corrections
-from datagen.mesh import Mesh, check_mesh
+from datagen.bodies.anny.rigs import Rig, carriers, parents_first, t_pose_corrections
+from datagen.common.seeding import Stream, generator
+from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
-from datagen.random import Stream, generator
 from datagen.recipe import AnnyBody, AnnyRig, AnnyTopology, PhenotypeRanges, PoseRecipe
 
 RIGS: tuple[AnnyRig, ...] = get_args(AnnyRig)

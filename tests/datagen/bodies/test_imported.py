@@ -10,10 +10,11 @@ from pydantic import ValidationError
 
 from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.bodies.imported import ImportedModel, frame
-from datagen.errors import BodyError, DatasetError, MeshError, RecipeError
+from datagen.common.errors import BodyError, DatasetError, MeshError, RecipeError
 from datagen.generate import generate, repair
 from datagen.importers import found_recipe
-from datagen.mesh import Mesh, save_mesh
+from datagen.mesh.files import save_mesh
+from datagen.mesh.geometry import Mesh
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.recipe import ImportedBody, LegBody, PoseRecipe
 from datagen.store.verify import find_faults

@@ -7,16 +7,16 @@ import pytest
 import scipy.sparse
 
 from datagen.bodies import load_body
+from datagen.bodies.proportions import Stretchable
 from datagen.bodies.rigged import RiggedModel, part_scales
-from datagen.bodies.stretching import Stretchable
-from datagen.characters import Character, load_character, load_characters
-from datagen.errors import BodyError, RecipeError
-from datagen.mesh import Mesh, check_mesh, edges_of
+from datagen.characters.character import Character, load_character, load_characters
+from datagen.characters.simplify import simplify
+from datagen.characters.weld import volume
+from datagen.common.errors import BodyError, RecipeError
+from datagen.common.seeding import Stream, generator
+from datagen.mesh.geometry import Mesh, check_mesh, edges_of
 from datagen.poses import Poses
-from datagen.random import Stream, generator
 from datagen.recipe import DatasetRecipe, RiggedBody
-from datagen.simplification import simplify
-from datagen.surfaces import volume
 from tests.support.real_animals import require_animals
 from tests.support.rigged_files import BOXES, JOINTS, Floats, Rig
 

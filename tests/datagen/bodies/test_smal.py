@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from datagen.bodies import load_body, require_joints
-from datagen.bodies.smal import SmalModel
-from datagen.errors import BodyError
-from datagen.mesh import Mesh, check_mesh
-from datagen.model_search import FOLDER_VARIABLE, find_model
+from datagen.bodies.smpl_family.model_search import FOLDER_VARIABLE, find_model
+from datagen.bodies.smpl_family.smal import SmalModel
+from datagen.bodies.standins.smpl_format import write_standin
+from datagen.common.errors import BodyError
+from datagen.common.seeding import Stream, generator
+from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
-from datagen.random import Stream, generator
 from datagen.recipe import PoseRecipe, RangePoses, SmalBody
-from datagen.standins import write_standin
 from tests.support.models import Arrays, random_model, reference, save_npz, save_pickle
 
 RANGES = PoseRecipe(distribution=RangePoses(skeleton="smal", uniform=20))

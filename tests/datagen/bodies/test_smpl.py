@@ -13,15 +13,15 @@ from smplx.utils import Struct
 from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
-from datagen.bodies.layout import LayoutBody
-from datagen.bodies.smpl import SmplModel, joint_names
-from datagen.errors import BodyError
-from datagen.model_files import read_model
-from datagen.model_search import find_model
+from datagen.bodies.smpl_family.blend_shapes import LayoutBody
+from datagen.bodies.smpl_family.model_file import read_model
+from datagen.bodies.smpl_family.model_search import find_model
+from datagen.bodies.smpl_family.smpl import SmplModel, joint_names
+from datagen.bodies.standins.smpl_format import standin, write_standin
+from datagen.common.errors import BodyError
+from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
-from datagen.random import Stream, generator
 from datagen.recipe import AnnyBody, MixedBody, PoseRecipe, RangePoses, SmplBody
-from datagen.standins import standin, write_standin
 from tests.support.models import arrays_of, random_model, reference, save_npz, tree
 
 MODELS = ("smpl", "smplh", "smplx")

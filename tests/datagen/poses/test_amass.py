@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datagen.errors import RecipeError
+from datagen.common.errors import RecipeError
 from datagen.poses import JOINTS, draw_poses, load_poses
 from datagen.poses.amass import smpl_pose
 from datagen.recipe import PoseRecipe

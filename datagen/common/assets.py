@@ -1,0 +1,38 @@
+"""What data was made from: packages and files, with licence and hash, so that the same bytes can be made again."""
+
+import errno
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.common.errors import BodyError
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A package or a file: its licence, and its version or the hash of its content."""
+
+    name: str
+    licence: str
+    version: str
+
+
+def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
+    """A file as an asset, known by the sha256 of its bytes.
+
+    Raises
+    ------
+    BodyError
+        It cannot be read.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError(errno.EINVAL, "it is no regular file")  # opening a pipe would wait
+        with open(path, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise BodyError(
+            f"{path}, which the data is made from, cannot be read ({error.strerror or error}). Put it there, or name "
+            "another in the recipe"
+        ) from error
+    return Asset(name or path.name, licence, f"sha256:{digest}")

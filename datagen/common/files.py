@@ -1,0 +1,188 @@
+"""Reading files that somebody else named: inside their folder only, regular files only, of a bounded size only.
+
+A dataset, a run or a mesh that was downloaded says which files belong to it. What it says is not to be trusted: a name
+may lead out of its folder, a link may lead anywhere, and a device such as /dev/zero never ends.
+"""
+
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from filelock import FileLock
+
+from datagen.common.errors import DamagedFileError, UnsafeFileError, storage_errors
+
+TEXT_LIMIT = 16 * 2**20
+"""Bytes of a text or JSON file of ours; the longest that are written have some hundred thousand."""
+
+
+def resolve_within(folder: Path, name: str) -> Path:
+    """Return the path of ``name`` below ``folder``, symbolic links resolved; it need not exist.
+
+    Raises
+    ------
+    UnsafeFileError
+        The name is empty or absolute, holds "..", a NUL or a backslash, or a link leads out of the folder.
+    """
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name or "\\" in name:
+        raise UnsafeFileError(f"{folder} names {name!r}, which is not a path inside it. Do not trust what it holds")
+    root = Path(os.path.realpath(folder))
+    path = Path(os.path.realpath(root / name))
+    if not path.is_relative_to(root) or path.is_symlink():  # what is a link still leads to itself
+        raise UnsafeFileError(
+            f"{folder} names {name!r}, a link that leads out of it. Do not trust what it holds; a link of "
+            "yours may lead to the whole folder"
+        )
+    return path
+
+
+def refuse_links_out(folder: Path) -> None:
+    """Raise if something directly in a folder, which need not exist, is a link that leads out of it.
+
+    Raises
+    ------
+    UnsafeFileError
+        With the first such link.
+    """
+    if folder.is_dir():
+        for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+            if entry.is_symlink():
+                resolve_within(folder, entry.name)
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file for reading, without waiting for anything.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is not a regular file (a device, a pipe, a socket, a folder).
+    OSError
+        It is not there, or cannot be read.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not wait
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise UnsafeFileError(f"{path} is not a regular file") from error
+        raise
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return open(descriptor, "rb")
+    os.close(descriptor)
+    raise UnsafeFileError(f"{path} is not a regular file")
+
+
+def read_bounded(path: Path, *, limit: int) -> bytes:
+    """Return the content of a regular file of at most ``limit`` bytes.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is not a regular file (a device, a pipe, a folder), or it is longer than that.
+    OSError
+        It is not there, or cannot be read.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1) if size <= limit else b""  # some files, as those of /proc, have no size
+    if max(size, len(content)) > limit:
+        raise UnsafeFileError(f"{path} is longer than the {limit:,} bytes that it can have ({size:,})")
+    return content
+
+
+def read_within(folder: Path, name: str, *, limit: int = TEXT_LIMIT) -> bytes:
+    """Return the content of a regular file of at most ``limit`` bytes inside a folder.
+
+    Raises
+    ------
+    UnsafeFileError
+        It leads out of the folder, is not a regular file, or is longer than that.
+    OSError
+        It is not there, or cannot be read.
+    """
+    return read_bounded(resolve_within(folder, name), limit=limit)
+
+
+def read_text_within(folder: Path, name: str, *, limit: int = TEXT_LIMIT) -> str:
+    """Return the text of a UTF-8 file inside a folder; see :func:`read_within`.
+
+    Raises
+    ------
+    DamagedFileError
+        It is not UTF-8.
+    UnsafeFileError, OSError
+        As :func:`read_within` does.
+    """
+    try:
+        return read_within(folder, name, limit=limit).decode()
+    except UnicodeDecodeError as error:
+        raise DamagedFileError(f"{folder / name} is not a text in UTF-8 ({error.reason})") from error
+
+
+def lock_within(folder: Path, name: str) -> FileLock:
+    """Return the lock that a file in a folder is; the file is made when the lock is taken.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is a link that leads out of the folder, where another file would be made or opened, or no regular file.
+    """
+    path = resolve_within(folder, name)
+    if path.exists() and not path.is_file():
+        raise UnsafeFileError(f"{path} is not a regular file. Remove it, then run again")
+    return FileLock(path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk has the names of a folder's files, where its file system can say so."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network file systems know no such thing
+            raise
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing that appears at ``path`` whole when the block ends, or not at all; creates its folder.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, or the place cannot be written to.
+    """
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.parent / f".{path.name}.{secrets.token_hex(8)}.partial"
+        try:
+            with open(temporary, "xb") as file:  # not mkstemp, whose files nobody but the owner may read
+                yield file
+                file.flush()
+                os.fsync(file.fileno())  # renamed before its content is on the disk, a power failure leaves it empty
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all, creating its folder.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, or the place cannot be written to.
+    """
+    with atomic_file(path) as file:
+        file.write(content)

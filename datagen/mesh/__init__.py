@@ -1,0 +1,1 @@
+"""Meshes: geometry, files, sequences of files, limits."""

@@ -1,0 +1,232 @@
+"""OBJ files as a person has them: the text is kept, and only positions and normals in it are written anew.
+
+So materials, groups, smoothing groups, quads, vertex colours, comments and the order of everything stay as they are.
+Lines that go on in the next are joined; names may be of any 8-bit encoding. Free-form surfaces are kept, not posed.
+"""
+
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.mesh.formats.mtl import LibraryFiles, read_library
+from datagen.mesh.formats.surface import Encoded, Surface, numbers, shared_normals
+
+_PATTERNS = {
+    (0,): re.compile(rb"\s*f(?:\s+-?\d+)+\s*"),
+    (0, 1): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+)+\s*"),
+    (0, 2): re.compile(rb"\s*f(?:\s+-?\d+//-?\d+)+\s*"),
+    (0, 1, 2): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+/-?\d+)+\s*"),
+}
+_ELEMENTS = (b"v", b"vt", b"vn", b"f", b"usemtl", b"mtllib", b"o", b"g", b"s", b"l", b"p")
+
+
+class ObjContent:
+    """The text of an OBJ file and what its lines mean."""
+
+    def __init__(self, content: bytes, path: Path) -> None:
+        if content[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in content[:4096]:
+            raise ValueError("it is binary or UTF-16 text; OBJ is plain text: save it as UTF-8")
+        text = content.removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+        self._path = path
+        self._break = b"\n" if b"\n" in text or b"\r" not in text else b"\r"
+        self._lines = text.split(self._break)
+        self._at: dict[bytes, list[int]] = {element: [] for element in _ELEMENTS}
+        for number, line in enumerate(self._lines):
+            words = line.split(None, 1)
+            if words and words[0] in self._at:
+                self._at[words[0]].append(number)
+        self.vertices = self._numbers(b"v", 3, needed=3)
+
+    @property
+    def name(self) -> str | None:
+        """The first object's name."""
+        return next(iter(self._names(b"o")), None)
+
+    @property
+    def only_here(self) -> list[str]:
+        """Groups, smoothing groups, names of several objects, lines and points."""
+        named = {b"g": "groups", b"s": "smoothing groups", b"l": "lines", b"p": "points"}
+        objects = ["names of its objects"] if len(self._at[b"o"]) > 1 else []
+        return objects + [name for element, name in named.items() if self._at[element]]
+
+    @cached_property
+    def _face_corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers [corner, 3] of vertex, texture coordinate and normal (-1 for none), and corners of each face."""
+        lines = self._of(b"f")
+        sizes = np.array([len(_words(line)) - 1 for line in lines], np.int64)
+        table = _written_corners(lines)
+        line_of = np.repeat(np.array(self._at[b"f"], np.int64), sizes)
+        for column, element in enumerate((b"v", b"vt", b"vn")):
+            before = np.searchsorted(np.array(self._at[element], np.int64), line_of)
+            numbers = table[:, column].copy()
+            table[:, column] = np.where(numbers < 0, numbers + before, numbers - 1)
+            self._require_known(table[:, column], element, needed=column == 0, backwards=numbers < 0)
+        return table, sizes
+
+    def _require_known(self, found: NDArray[Any], element: bytes, *, needed: bool, backwards: NDArray[Any]) -> None:
+        lowest = 0 if needed else -1
+        wrong = (found >= len(self._at[element])) | (found < lowest) | (backwards & (found < 0))
+        if wrong.any():
+            what = {b"v": "vertex", b"vt": "texture coordinate", b"vn": "normal"}[element]
+            number = found[wrong][0] + 1
+            raise ValueError(f"a face names {what} {number}, but there are {len(self._at[element])} (from 1)")
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The faces, with materials from the libraries beside the file."""
+        table, sizes = self._face_corners
+        names = self._names(b"usemtl")
+        known = {material.name: material for material in self._libraries.materials}
+        used = list(dict.fromkeys(name for name in names if name in known))
+        current = np.searchsorted(np.array(self._at[b"usemtl"], np.int64), np.array(self._at[b"f"], np.int64)) - 1
+        number_of = np.array([used.index(name) if name in used else -1 for name in names] + [-1], np.int64)
+        return Surface(
+            corners=table[:, 0],
+            sizes=sizes,
+            uvs=self._uvs(table[:, 1]),
+            shading=self._shading[0] if len(table) and self._shading[0].min() >= 0 else None,
+            colours=self._colours(),
+            material_of=number_of[current] if used else None,
+            materials=tuple(known[name] for name in used),
+        )
+
+    def _uvs(self, numbers: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        if not self._at[b"vt"] or not (numbers >= 0).any():
+            return None
+        written = np.concatenate([self._numbers(b"vt", 2, needed=1), np.zeros((1, 2))])
+        return written[numbers]
+
+    def _colours(self) -> NDArray[np.uint8] | None:
+        lines = self._of(b"v")
+        rows = [_words(line) for line in lines] if lines and len(_words(lines[0])) == 7 else []
+        if not rows or any(len(row) != 7 for row in rows):
+            return None
+        written = _as_numbers([row[4:] for row in rows], 3)
+        colours = np.clip(written / (255 if written.max(initial=0) > 1 else 1), 0, 1)
+        return np.concatenate([np.rint(colours * 255), np.full((len(rows), 1), 255.0)], axis=1).astype(np.uint8)
+
+    @cached_property
+    def _shading(self) -> tuple[NDArray[np.int64], bool]:
+        """Group [corner] of every corner, one for each vertex and normal that go together, -1 where there is no normal.
+
+        And whether the groups are the file's normals: so where no two vertices share one, and each can stay in place.
+        """
+        table, _ = self._face_corners
+        with_normal = table[:, 2] >= 0
+        both = table[with_normal, 2] * len(self.vertices) + table[with_normal, 0]
+        pairs, group = np.unique(both, return_inverse=True)
+        if len(np.unique(pairs // max(len(self.vertices), 1))) == len(pairs):
+            return table[:, 2], True
+        groups = np.full(len(table), -1, np.int64)
+        groups[with_normal] = group.ravel()
+        return groups, False
+
+    def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
+        """The text with other positions; normals follow them, edges that were sharp stay so."""
+        lines: list[bytes | None] = list(self._lines)
+        for number, line in zip(self._at[b"v"], self._position_lines(vertices), strict=True):
+            lines[number] = line
+        shading, in_place = self._shading
+        if (shading >= 0).any():
+            normals = shared_normals(vertices, self.surface, shading)
+            (self._replace_normals if in_place else self._renumber_normals)(lines, normals, shading)
+        return Encoded(self._break.join(line for line in lines if line is not None))
+
+    def _position_lines(self, vertices: NDArray[np.float64]) -> list[bytes]:
+        numbers = ("v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())).encode().splitlines()
+        rest = [[*line.split(None, 4), b""][4] for line in self._of(b"v")]
+        end = self._end
+        return [b"%b %b" % (line, tail) if tail else line + end for line, tail in zip(numbers, rest, strict=True)]
+
+    @property
+    def _end(self) -> bytes:
+        return b"\r" if self._lines[self._at[b"v"][0]].endswith(b"\r") else b""
+
+    def _replace_normals(
+        self, lines: list[bytes | None], normals: NDArray[np.float64], shading: NDArray[np.int64]
+    ) -> None:
+        used = np.unique(shading[shading >= 0])
+        for number, row in zip(used.tolist(), normals[used].tolist(), strict=True):
+            lines[self._at[b"vn"][number]] = _normal_line(row) + self._end
+
+    def _renumber_normals(
+        self, lines: list[bytes | None], normals: NDArray[np.float64], shading: NDArray[np.int64]
+    ) -> None:
+        """One block of normals where the first was, and faces that name them; the rest of each face stays as it is."""
+        numbers = iter((shading + 1).tolist())
+        for place in self._at[b"f"]:
+            words = _words(self._lines[place])
+            corners = [_with_normal(word, next(numbers)) for word in words[1:]]
+            lines[place] = b" ".join([b"f", *corners]) + self._end
+        for place in self._at[b"vn"]:
+            lines[place] = None
+        block = (self._end + self._break).join(_normal_line(row) for row in normals.tolist())
+        lines[self._at[b"vn"][0]] = block + self._end
+
+    def companions(self) -> Encoded:
+        """The material libraries and their textures."""
+        return Encoded(b"", self._libraries.beside, self._libraries.missing)
+
+    @cached_property
+    def _libraries(self) -> LibraryFiles:
+        return read_library(self._path.parent, self._names(b"mtllib"))
+
+    def _of(self, element: bytes) -> list[bytes]:
+        return [self._lines[number] for number in self._at[element]]
+
+    def _names(self, element: bytes) -> list[str]:
+        return [[*line.split(None, 1), b""][1].strip().decode("utf-8", "replace") for line in self._of(element)]
+
+    def _numbers(self, element: bytes, columns: int, *, needed: int) -> NDArray[np.float64]:
+        """The first numbers [line, column] of the lines of an element; 0 where a line has fewer."""
+        rows = [_words(line)[1 : columns + 1] for line in self._of(element)]
+        try:
+            if any(len(row) < needed for row in rows):
+                raise ValueError
+            return _as_numbers(rows, columns)
+        except ValueError:
+            at = next(n for n, row in zip(self._at[element], rows, strict=True) if not _is_numbers(row, needed))
+            shown = self._lines[at][:60].decode("utf-8", "replace").strip()
+            raise ValueError(f"line {at + 1} is not {needed} numbers: {shown!r}") from None
+
+
+def _words(line: bytes) -> list[bytes]:
+    return (line.partition(b"#")[0] if b"#" in line else line).split()
+
+
+def _as_numbers(rows: list[list[bytes]], columns: int) -> NDArray[np.float64]:
+    padded = [row if len(row) == columns else [*row, *[b"0"] * (columns - len(row))] for row in rows]
+    return numbers([word for row in padded for word in row]).reshape(len(rows), columns)
+
+
+def _is_numbers(row: list[bytes], needed: int) -> bool:
+    try:
+        return len([float(word) for word in row]) >= needed
+    except ValueError:
+        return False
+
+
+def _with_normal(corner: bytes, number: int) -> bytes:
+    return b"%b/%d" % (corner.rpartition(b"/")[0], number) if number else corner
+
+
+def _normal_line(normal: list[float]) -> bytes:
+    return b"vn %.6f %.6f %.6f" % tuple(normal)
+
+
+def _written_corners(lines: list[bytes]) -> NDArray[np.int64]:
+    """Numbers [corner, 3] as they are written, 0 where there is none. Files hold one form of corner, as a rule."""
+    bare = [line.partition(b"#")[0] if b"#" in line else line for line in lines]
+    for columns, pattern in _PATTERNS.items():
+        if bare and all(map(pattern.fullmatch, bare)):
+            joined = b" ".join(bare).replace(b"f", b" ").replace(b"/", b" ")
+            numbers = np.fromstring(joined, dtype=np.int64, sep=" ").reshape(-1, len(columns))
+            table = np.zeros((len(numbers), 3), np.int64)
+            table[:, columns] = numbers
+            return table
+    corners = [[*word.split(b"/"), b"", b""][:3] for line in bare for word in line.split()[1:]]
+    return np.array([[int(part or b"0") for part in corner] for corner in corners], np.int64).reshape(-1, 3)

@@ -1,0 +1,128 @@
+"""Sequences of meshes: the files of a numbered series, and one animated GLB of many frames."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.common.errors import MeshError
+from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
+from datagen.mesh.formats import FORMATS
+from datagen.mesh.formats.glb_writer import FRAME_LIMIT, LARGEST
+
+INTERPOLATIONS = ("LINEAR", "STEP")
+
+
+def frames_of(path: str | Path) -> list[Path]:
+    """The mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
+
+    The series of a numbered file are the files beside it that differ from it in that number alone.
+
+    In natural order: 2 before 10. A folder or pattern with mesh files of several formats is refused, for they would
+    take turns. A file without a number is a series of one.
+
+    Raises
+    ------
+    MeshError
+        No such file, no mesh files there, or several formats.
+    """
+    path = Path(path)
+    if path.is_dir():
+        found = [each for each in path.iterdir() if _is_mesh(each)]
+    elif path.is_file():
+        found = _series(path)
+    elif is_pattern(path):
+        name = _NUMBER.sub("[0-9]*", path.name)
+        found = [each for each in path.parent.glob(name) if _is_mesh(each)] if path.parent.is_dir() else []
+    else:
+        raise MeshError(f"no mesh file or folder at {path}")
+    if not found:
+        raise MeshError(f"{path} holds no mesh files ({', '.join(FORMATS)})")
+    kinds = sorted({each.suffix.lower() for each in found})
+    if len(kinds) > 1:
+        raise MeshError(f"{path} holds meshes of several formats; choose one with a pattern, such as '*{kinds[0]}'")
+    return sorted(found, key=_natural)
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path stands for several files; one that is there under this very name does not."""
+    return not path.exists() and (any(sign in path.name for sign in "*?[") or bool(_NUMBER.search(path.name)))
+
+
+_NUMBER = re.compile(r"%\d*d|#+")
+
+
+def _is_mesh(path: Path) -> bool:
+    return path.suffix.lower() in FORMATS and not path.name.startswith(".") and path.is_file()
+
+
+def _series(path: Path) -> list[Path]:
+    """Files beside one that differ from it in its last number alone."""
+    if path.suffix.lower() not in FORMATS:
+        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+    parts = re.fullmatch(r"(.*?)(\d+)(\D*)", path.stem)
+    if not parts:
+        return [path]
+    alike = re.compile(re.escape(parts[1]) + r"\d+" + re.escape(parts[3] + path.suffix))
+    return [each for each in path.parent.iterdir() if alike.fullmatch(each.name) and _is_mesh(each)]
+
+
+def _natural(path: Path) -> tuple[list[tuple[int, int | str]], str]:
+    parts = re.split(r"(\d+)", path.name)
+    return [(1, int(part)) if part.isdigit() else (0, part.lower()) for part in parts if part], path.name
+
+
+def require_animation(original: MeshFile, frames: int) -> None:
+    """Refuse so many frames of a mesh as one animation, before any is made.
+
+    Raises
+    ------
+    MeshError
+        They are more than ``FRAME_LIMIT``, or than 4 GiB.
+    """
+    if frames > FRAME_LIMIT:
+        raise MeshError(f"{frames:,} frames are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere")
+    size = frames * draft_of(original).frame_bytes
+    if size > LARGEST:
+        raise MeshError(f"{frames:,} frames of {original.path} need {size:,} bytes, an animated GLB holds 4 GiB")
+
+
+def write_animation(
+    original: MeshFile,
+    frames: Iterable[NDArray[np.floating]],
+    out: Path,
+    *,
+    frames_per_second: float,
+    interpolation: str = "LINEAR",
+) -> None:
+    """Write frames [frame, n, 3] of a mesh as one GLB with an animation; the file appears whole or not at all.
+
+    Frame k is a morph target, the difference from frame 0, and shows alone at k / ``frames_per_second`` seconds; LINEAR
+    moves vertices straight from one to the next, STEP jumps. Materials, textures and texture coordinates are the
+    original's; normals move along, so a file that has none becomes smooth. Frames may be made one by one: in memory are
+    one frame and frames x frames weights of four bytes, the rest waits on disk (24 bytes a vertex and frame, as in the
+    file).
+
+    At most 2,000 frames and 4 GiB. Players keep all morph targets in a texture of the graphics card; WebGL promises
+    room for 256 of them, usual cards have 2,048.
+
+    Raises
+    ------
+    MeshError
+        ``out`` is no .glb, no frame or too many, frames that are not the mesh's in shape or not finite, or a rate or
+        interpolation that cannot be.
+    StorageError
+        The file could not be written.
+    """
+    out = Path(out)
+    if out.suffix.lower() != ".glb":
+        raise MeshError(f"{out}: an animation is a .glb file, not {out.suffix!r}")
+    if not (np.isfinite(frames_per_second) and frames_per_second > 0):
+        raise MeshError(f"frames per second must be above 0, not {frames_per_second}")
+    if interpolation not in INTERPOLATIONS:
+        raise MeshError(f"interpolation {interpolation!r} is none of {', '.join(INTERPOLATIONS)}")
+    check_writable(out)
+    sound = (usable(original, frame) for frame in frames)
+    draft_of(original).animated(sound, out, frames_per_second=frames_per_second, interpolation=interpolation)

@@ -1,0 +1,62 @@
+"""The typed recipe of a dataset: its body, its poses, its sizes."""
+
+from datagen.recipe.base import Frozen, Range
+from datagen.recipe.bodies import (
+    AnnyBody,
+    AnnyRig,
+    AnnyTopology,
+    Axis,
+    Body,
+    ImportedBody,
+    LegBody,
+    MixedBody,
+    PhenotypeRanges,
+    RiggedBody,
+    SingleBody,
+    SmalBody,
+    SmplBody,
+)
+from datagen.recipe.dataset import (
+    ANIMALS,
+    PATH_KEYS,
+    DatasetRecipe,
+    EvaluationTriples,
+    Growth,
+    IdentityRecipe,
+    PoseRecipe,
+    StoreRecipe,
+)
+from datagen.recipe.poses import AmassPoses, ClipPoses, Distribution, FilePoses, FoundPoses, NptPoses, RangePoses
+
+__all__ = [
+    "ANIMALS",
+    "PATH_KEYS",
+    "AmassPoses",
+    "AnnyBody",
+    "AnnyRig",
+    "AnnyTopology",
+    "Axis",
+    "Body",
+    "ClipPoses",
+    "DatasetRecipe",
+    "Distribution",
+    "EvaluationTriples",
+    "FilePoses",
+    "FoundPoses",
+    "Frozen",
+    "Growth",
+    "IdentityRecipe",
+    "ImportedBody",
+    "LegBody",
+    "MixedBody",
+    "NptPoses",
+    "PhenotypeRanges",
+    "PoseRecipe",
+    "Range",
+    "RangePoses",
+    "RiggedBody",
+    "SingleBody",
+    "SmalBody",
+    "SmplBody",
+    "StoreRecipe",
+]

@@ -1,0 +1,117 @@
+"""Normalisation, edges, and mesh files good and bad."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from datagen.common.errors import MeshError, StorageError
+from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.formats import FORMATS
+from datagen.mesh.geometry import Mesh, bounding_box, bounds, check_mesh, edges_of
+
+TETRAHEDRON = Mesh(
+    np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+)
+
+
+@given(st.integers(0, 10_000), st.floats(0.01, 100), st.floats(-50, 50))
+def test_normalisation_fills_the_box_and_undoes(seed: int, size: float, shift: float) -> None:
+    vertices = np.random.default_rng(seed).normal(size=(2, 20, 3)) * size + shift
+    box = bounding_box(vertices)
+    unit = box.normalise(vertices)
+    assert np.allclose(np.abs(unit).max(axis=(1, 2)), 1) and np.allclose(unit.max(axis=1) + unit.min(axis=1), 0)
+    assert np.allclose(box.restore(unit), vertices)
+
+
+def test_normalisation_of_the_tetrahedron_by_hand() -> None:
+    unit = bounding_box(TETRAHEDRON.vertices).normalise(TETRAHEDRON.vertices)
+    assert np.allclose(unit[3], [-1 / 3, -2 / 3, 1])
+
+
+def test_edges_are_unique_and_sorted() -> None:
+    assert edges_of(TETRAHEDRON.faces).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+
+
+@pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".stl"}))
+def test_files_keep_vertices_and_their_order(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"mesh{suffix}"
+    save_mesh(TETRAHEDRON, path)
+    read = load_mesh(path)
+    assert np.allclose(read.vertices, TETRAHEDRON.vertices, atol=1e-6) and np.array_equal(read.faces, TETRAHEDRON.faces)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("", r"is empty \(0 bytes\)"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+        ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite, the first is number 1"),
+        ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
+    ],
+)
+def test_unusable_files_say_what_and_where(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "bad.obj"
+    path.write_text(content)
+    with pytest.raises(MeshError, match=message) as caught:
+        load_mesh(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_unknown_and_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="no mesh file at"):
+        load_mesh(tmp_path / "none.obj")
+    (tmp_path / "a.fbx").write_text("x")
+    with pytest.raises(MeshError, match=r"unknown mesh format '\.fbx'"):
+        load_mesh(tmp_path / "a.fbx")
+    (tmp_path / "a.glb").write_bytes(b"not a glb at all")
+    with pytest.raises(MeshError, match="cannot be read as a GLB"):
+        load_mesh(tmp_path / "a.glb")
+
+
+def test_a_glb_that_says_another_type_is_one_error(tmp_path: Path) -> None:
+    save_mesh(TETRAHEDRON, tmp_path / "a.glb")
+    content = (tmp_path / "a.glb").read_bytes()
+    start, end = content.index(b'[{"attributes"'), content.index(b"}]", content.index(b'[{"attributes"')) + 2
+    (tmp_path / "a.glb").write_bytes(content[:start] + b'["x"]'.ljust(end - start) + content[end:])
+    with pytest.raises(MeshError, match="cannot be read as a GLB"):
+        load_mesh(tmp_path / "a.glb")
+
+
+def test_faces_that_index_nothing() -> None:
+    with pytest.raises(MeshError, match="faces name vertex 9"):
+        check_mesh(Mesh(TETRAHEDRON.vertices, np.array([[0, 1, 9]])), name="mine")
+
+
+def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StorageError, match="could not write"):
+        save_mesh(TETRAHEDRON, tmp_path / "file" / "mesh.obj")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_obj_with_materials_groups_and_texture_seams_keeps_its_one_list_of_vertices(tmp_path: Path) -> None:
+    """As bodies from artists' tools come: skin and clothes as materials, a vertex with two texture coordinates."""
+    (tmp_path / "person.mtl").write_text("newmtl skin\nnewmtl cloth\n")
+    (tmp_path / "person.obj").write_text(
+        "mtllib person.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
+        "g torso\nusemtl skin\nf 1/1 2/2 3/3\ng legs\nusemtl cloth\nf 1/4 3/3 4/2\nf 2/1 4/4 3/2\n"
+    )
+    mesh = load_mesh(tmp_path / "person.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 3, 2]]
+
+
+@pytest.mark.parametrize("vertices", [1, 127, 128, 300])
+def test_bounds_are_those_of_each_mesh_and_show_what_is_not_finite(vertices: int) -> None:
+    meshes = np.random.default_rng(0).normal(size=(4, vertices, 3)).astype(np.float32)
+    low, high = bounds(meshes)
+    assert np.array_equal(low, meshes.min(axis=1)) and np.array_equal(high, meshes.max(axis=1))
+    for bad in (np.nan, np.inf, -np.inf):
+        spoiled = meshes.copy()
+        spoiled[2, vertices // 2, 1] = bad
+        finite = np.isfinite(np.stack(bounds(spoiled))).all(axis=(0, 2))
+        assert finite.tolist() == [True, True, False, True]

@@ -1,0 +1,218 @@
+"""GLB files of a person: what a viewer shows is what is posed, and the rest of the file stays."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from datagen.common.errors import MeshError
+from datagen.mesh.files import read_mesh_file, write_posed
+from datagen.mesh.formats.gltf import Gltf
+from tests.support.rigged_files import Document
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+PNG = b"\x89PNG\r\n\x1a\n of no picture"
+
+
+def scene(**primitive: Any) -> Document:
+    """A textured tetrahedron with normals, in two primitives that share vertices, below a node that moves it."""
+    document = Document()
+    shared = {
+        "POSITION": document.accessor(POINTS),
+        "NORMAL": document.accessor(POINTS / np.maximum(np.linalg.norm(POINTS, axis=1, keepdims=True), 1)),
+        "TEXCOORD_0": document.accessor(POINTS[:, :2] / 4),
+        "_MARK": document.accessor(np.arange(4), "uint16"),
+    }
+    pieces = [
+        {"attributes": dict(shared), "indices": document.accessor(part.ravel(), "uint16"), "material": number}
+        for number, part in enumerate((FACES[:2], FACES[2:]))
+    ]
+    image = document.view(PNG)
+    document.json |= {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"name": "root", "children": [1], "translation": [10, 0, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
+            {"name": "body", "mesh": 0, "scale": [2, 2, -2]},
+        ],
+        "meshes": [{"primitives": [piece | primitive for piece in pieces]}],
+        "materials": [
+            {"name": "skin", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}, "emissiveFactor": [0.1, 0, 0]},
+            {"name": "cloth", "pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}},
+        ],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": image, "mimeType": "image/png"}],
+    }
+    return document
+
+
+def saved(document: Document, folder: Path) -> Path:
+    return document.save(folder / "scene.glb")
+
+
+def sound(path: Path) -> dict[str, Any]:
+    """The JSON of a file whose chunks and buffer views lie as they should."""
+    content = path.read_bytes()
+    magic, version, length, json_length = struct.unpack_from("<4sIII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content)) and json_length % 4 == 0
+    described = json.loads(content[20 : 20 + json_length])
+    binary = struct.unpack_from("<I", content, 20 + json_length)[0]
+    assert binary == len(content) - 28 - json_length == described["buffers"][0]["byteLength"]
+    assert all(
+        v["byteOffset"] % 4 == 0 and v["byteOffset"] + v["byteLength"] <= binary for v in described["bufferViews"]
+    )
+    for accessor in range(len(described["accessors"])):
+        Gltf(path).accessor(accessor)
+    return described
+
+
+def test_vertices_are_those_of_the_world_and_come_back_through_the_nodes(tmp_path: Path) -> None:
+    read = read_mesh_file(saved(scene(), tmp_path))
+    expected = (POINTS * (2, 2, -2))[:, [1, 0, 2]] * (-1, 1, 1) + (10, 0, 0)
+    assert read.name == "body" and np.allclose(read.mesh.vertices, expected, atol=1e-6)
+    assert np.array_equal(read.mesh.faces, FACES)
+    moved = read.mesh.vertices * (1, 2, 3) + 1
+    assert write_posed(read, moved, tmp_path / "out.glb") == []
+    again = read_mesh_file(tmp_path / "out.glb")
+    assert np.allclose(again.mesh.vertices, moved, atol=1e-5) and np.array_equal(again.mesh.faces, FACES)
+    loaded = trimesh.load(tmp_path / "out.glb", process=False, force="mesh")
+    assert np.allclose(np.sort(loaded.triangles.ravel()), np.sort(moved[FACES].ravel()), atol=1e-5)
+
+
+def test_nodes_materials_textures_and_attributes_stay(tmp_path: Path) -> None:
+    document = scene()
+    read = read_mesh_file(saved(document, tmp_path))
+    write_posed(read, read.mesh.vertices * 2, tmp_path / "out.glb")
+    after = sound(tmp_path / "out.glb")
+    assert after["nodes"] == document.json["nodes"] and after["materials"] == document.json["materials"]
+    file = Gltf(tmp_path / "out.glb")
+    pieces = after["meshes"][0]["primitives"]
+    assert len({piece["attributes"]["POSITION"] for piece in pieces}) == 1
+    for piece, before in zip(pieces, document.json["meshes"][0]["primitives"], strict=True):
+        original = Gltf(tmp_path / "scene.glb")
+        assert piece["material"] == before["material"]
+        for name in ("TEXCOORD_0", "_MARK"):
+            kept = file.accessor(piece["attributes"][name])
+            assert np.array_equal(kept, original.accessor(before["attributes"][name]))
+    assert PNG in (tmp_path / "out.glb").read_bytes()
+    assert POINTS.tobytes() not in (tmp_path / "out.glb").read_bytes()  # nothing of the old shape is left in it
+
+
+def test_normals_follow_the_pose_and_are_one_across_a_seam(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(3)
+    seam = 2 * len(ball.vertices)
+    document = Document()
+    attributes = {
+        "POSITION": document.accessor(np.tile(ball.vertices, (2, 1))),
+        "NORMAL": document.accessor(np.tile(ball.vertices, (2, 1))),
+    }
+    halves = np.where(ball.triangles_center[:, :1] > 0, ball.faces, ball.faces + len(ball.vertices))
+    piece = {"attributes": attributes, "indices": document.accessor(halves.ravel(), "uint16")}
+    document.json |= {"nodes": [{"mesh": 0}], "meshes": [{"name": "ball", "primitives": [piece]}]}
+    read = read_mesh_file(saved(document, tmp_path))
+    assert len(read.mesh.vertices) == seam and read.components == 1 and read.name == "ball"
+    stretched = read.mesh.vertices * (1, 1, 4)
+    write_posed(read, stretched, tmp_path / "out.glb")
+    written = sound(tmp_path / "out.glb")["meshes"][0]["primitives"][0]["attributes"]
+    normals = Gltf(tmp_path / "out.glb").accessor(written["NORMAL"])
+    expected = stretched / (1, 1, 16)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    assert np.allclose(normals, expected, atol=0.06)
+    assert np.array_equal(normals[: seam // 2], normals[seam // 2 :])
+
+
+def test_skin_animation_and_morphs_are_applied_at_rest_then_dropped_and_named(tmp_path: Path) -> None:
+    document = scene()
+    joints, weights = (
+        document.accessor(np.tile([0, 1, 0, 0], (4, 1)), "uint8"),
+        document.accessor([[0.5, 0.5, 0, 0]] * 4),
+    )
+    target = {"POSITION": document.accessor(np.ones((4, 3)))}
+    for piece in document.json["meshes"][0]["primitives"]:
+        piece["attributes"] |= {"JOINTS_0": joints, "WEIGHTS_0": weights}
+        piece["targets"] = [target]
+    document.json["meshes"][0]["weights"] = [0.25]
+    document.json["nodes"] += [{"name": "a", "translation": [0, 4, 0]}, {"name": "b", "scale": [3, 3, 3]}]
+    document.json["nodes"][1]["skin"] = 0
+    document.json["skins"] = [{"joints": [2, 3]}]
+    times = document.accessor([0.0, 1.0])
+    sampler = {"input": times, "output": document.accessor(np.zeros((2, 3)))}
+    channel = {"sampler": 0, "target": {"node": 2, "path": "translation"}}
+    document.json["animations"] = [{"samplers": [sampler], "channels": [channel]}]
+    read = read_mesh_file(saved(document, tmp_path))
+    rest = POINTS + 0.25
+    assert np.allclose(read.mesh.vertices, (rest + np.array([0, 4, 0])) / 2 + 3 * rest / 2, atol=1e-6)
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.glb")
+    assert notes == ["skins", "animations", "morph targets"]
+    again = read_mesh_file(tmp_path / "out.glb")
+    assert np.allclose(again.mesh.vertices, read.mesh.vertices, atol=1e-5)
+    after = sound(tmp_path / "out.glb")
+    assert not {"skins", "animations"} & set(after) and "weights" not in after["meshes"][0]
+    assert [node["name"] for node in after["nodes"]] == ["root", "body", "a", "b"]
+
+
+def test_a_scene_of_several_geometries_is_refused_until_one_is_chosen(tmp_path: Path) -> None:
+    both = trimesh.Scene({"body": trimesh.creation.icosphere(1), "hat": trimesh.creation.box()})
+    both.export(tmp_path / "both.glb")
+    with pytest.raises(MeshError, match=r"holds 2 geometries: 'body', 'hat'. Choose one with --source-geometry"):
+        read_mesh_file(tmp_path / "both.glb")
+    with pytest.raises(MeshError, match="no geometry 'shoe'; it has 'body', 'hat'"):
+        read_mesh_file(tmp_path / "both.glb", geometry="shoe")
+    read = read_mesh_file(tmp_path / "both.glb", geometry="hat")
+    assert len(read.mesh.faces) == 12
+    assert write_posed(read, read.mesh.vertices, tmp_path / "hat.glb") == ["other geometries: body"]
+    assert read_mesh_file(tmp_path / "hat.glb").name == "hat"
+    assert len(sound(tmp_path / "hat.glb")["meshes"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"nodes": []}, "no faces"),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "without compression"),
+        ({"nodes": [{"mesh": 0, "scale": [0, 0, 0]}]}, "scaled to nothing"),
+        ({"nodes": [{"mesh": 7}]}, "cannot be read as GLB"),
+        ({"accessors": []}, "cannot be read|damaged"),
+    ],
+)
+def test_scenes_that_cannot_be_posed(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    document = scene()
+    document.json |= change
+    with pytest.raises(MeshError, match=message) as caught:
+        read_mesh_file(saved(document, tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("uri", "kept"), [("skin.png", True), ("../secret.png", False), ("{}/secret.png", False)])
+def test_a_texture_beside_goes_into_the_file_but_none_from_elsewhere(tmp_path: Path, uri: str, kept: bool) -> None:
+    document = scene()
+    document.json["images"] = [{"uri": uri.format(tmp_path)}]
+    (tmp_path / "secret.png").write_bytes(PNG + b"elsewhere")
+    read = read_mesh_file(saved(document, tmp_path / "mine"))
+    (tmp_path / "mine" / "skin.png").write_bytes(PNG + b"beside")
+    write_posed(read, read.mesh.vertices, tmp_path / "out.glb")
+    content = (tmp_path / "out.glb").read_bytes()
+    assert (PNG + b"beside" in content) == kept and b"elsewhere" not in content
+
+
+def test_points_alone_are_no_mesh(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="no faces"):
+        read_mesh_file(saved(scene(mode=0), tmp_path))
+
+
+def test_a_face_that_names_no_vertex(tmp_path: Path) -> None:
+    document = scene()
+    document.json["meshes"][0]["primitives"][0]["indices"] = document.accessor([0, 1, 9], "uint16")
+    with pytest.raises(MeshError, match="names vertex 9, but there are 4"):
+        read_mesh_file(saved(document, tmp_path))
+
+
+def test_properties_of_materials_that_an_obj_cannot_hold_are_named(tmp_path: Path) -> None:
+    read = read_mesh_file(saved(scene(), tmp_path))
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.obj")
+    assert notes == ["material properties beyond base colour and its texture"]

@@ -1,0 +1,218 @@
+"""Accidents that left, or could leave, a dataset that looks sound and is not."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datagen.bodies.leg import LegModel
+from datagen.common.assets import Asset
+from datagen.common.errors import DatasetError
+from datagen.generate import append, ensure_shard, generate, make_shard, repair
+from datagen.grid import Grid
+from datagen.recipe import DatasetRecipe
+from datagen.store import open_dataset
+from datagen.store.schema import open_group, shard_path
+from datagen.store.verify import find_faults
+from datagen.store.writer import write_shard
+from tests.support.files import tree_hash
+from tests.support.meshes import npt_folder
+from tests.support.recipes import tiny_dataset
+
+OTHER = tiny_dataset(identities={"training": 3, "evaluation": 2, "seed": 5})
+
+
+def unlock(url: Path) -> None:
+    open_group(str(url), mode="r+").update_attributes({"status": "building"})
+
+
+def test_vertices_that_are_in_no_face_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Anny's makehuman topology has them: the array is as wide as the body's meshes."""
+    real = LegModel.vertices
+
+    def with_loose_ones(self: LegModel, parameters: Any, poses: Any) -> Any:
+        vertices = real(self, parameters, poses)
+        return np.concatenate([vertices, vertices[:, :3]], axis=1)
+
+    monkeypatch.setattr(LegModel, "vertices", with_loose_ones)
+    made = generate(tiny_dataset(), str(tmp_path / "x.zarr"))
+    assert made.vertex_count(0) == made.faces(0).max() + 1 + 3
+    assert np.array_equal(made.vertices(0, 2), made.vertices(0)[2]) and not list(find_faults(made.url))
+
+
+def test_a_shard_of_another_shape_is_not_written(spoilable: Path) -> None:
+    shard, before = Grid(tiny_dataset()).shards()[0], tree_hash(spoilable)
+    with pytest.raises(DatasetError, match=r"of shape \[4, 31, 3\] instead of \[4, 32, 3\]"):
+        write_shard(str(spoilable), tiny_dataset(), shard, np.zeros((4, 31, 3), np.float32))
+    assert tree_hash(spoilable) == before
+
+
+def test_a_complete_dataset_of_other_files_is_not_taken_for_this_one(tmp_path: Path) -> None:
+    def imported(folder: str, size: float) -> DatasetRecipe:
+        meshes = npt_folder(tmp_path / folder, identities=range(4), poses=range(4))
+        (meshes / "0_0.ply").write_bytes((meshes / f"{int(size)}_{int(size)}.ply").read_bytes())
+        body = {"family": "imported", "layout": "npt", "path": str(meshes)}
+        poses = {"seen": 2, "unseen": 2, "distribution": {"name": "found"}}
+        return tiny_dataset(body=body, poses=poses, identities={"training": 2, "evaluation": 2})
+
+    url = str(tmp_path / "x.zarr")
+    generate(imported("a", 1), url)
+    before = tree_hash(url)
+    with pytest.raises(DatasetError, match=r"was made from npt meshes .*, but here is npt meshes"):
+        generate(imported("b", 2), url)
+    assert tree_hash(url) == before
+
+
+def test_a_late_task_of_another_recipe_writes_nothing(spoilable: Path) -> None:
+    before, shard = tree_hash(spoilable), Grid(OTHER).shards()[0]
+    with pytest.raises(DatasetError, match="is being made by another recipe now"):
+        ensure_shard(str(spoilable), OTHER, shard)
+    with pytest.raises(DatasetError, match="is being made by another recipe now"):
+        write_shard(str(spoilable), OTHER, shard, make_shard(OTHER, shard))
+    assert tree_hash(spoilable) == before
+
+
+def test_shards_without_a_root_are_not_adopted(spoilable: Path) -> None:
+    (spoilable / "zarr.json").unlink()
+    with pytest.raises(DatasetError, match="holds what is not a dataset"):
+        generate(OTHER, str(spoilable))
+
+
+def test_a_removal_that_was_cut_short_still_knows_its_own(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Path] = []
+
+    def dying(path: Path, **options: Any) -> None:
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(path)
+        real(path, **options)
+
+    real = shutil.rmtree
+    monkeypatch.setattr(shutil, "rmtree", dying)
+    with pytest.raises(KeyboardInterrupt):
+        generate(OTHER, str(spoilable), fresh=True)
+    monkeypatch.undo()
+    with pytest.raises(DatasetError, match="another recipe"):
+        generate(OTHER, str(spoilable))
+    assert generate(OTHER, str(spoilable), fresh=True).recipe == OTHER
+
+
+@pytest.mark.parametrize(
+    "change",
+    [('"seed": 0', '"seed": 1'), ('"0002": "training"', '"0002": "evaluation"'), ('"metres"', '"inches"')],
+    ids=["recipe", "splits", "units"],
+)
+def test_attributes_changed_by_hand_are_written_anew_from_the_given_recipe(
+    dataset: str, spoilable: Path, change: tuple[str, str]
+) -> None:
+    root = spoilable / "zarr.json"
+    changed = root.read_text().replace(*change)
+    assert changed != root.read_text()
+    root.write_text(changed)
+    generate(tiny_dataset(), str(spoilable))
+    assert tree_hash(spoilable) == tree_hash(dataset)
+
+
+def test_repair_does_not_trust_a_recipe_that_was_changed_by_hand(spoilable: Path) -> None:
+    root = spoilable / "zarr.json"
+    root.write_text(root.read_text().replace('"seed": 0', '"seed": 1'))
+    stored = open_group(str(spoilable)).attrs["recipe"]
+    with pytest.raises(DatasetError, match=r"another recipe|not the one that it was made by"):
+        repair(str(spoilable), DatasetRecipe.model_validate(stored), list(find_faults(str(spoilable))))
+
+
+def test_growing_from_what_is_no_longer_there_is_refused(spoilable: Path) -> None:
+    """Two appends at once, on a store without a lock: the second does not overwrite the first."""
+    from datagen.bodies import load_body
+    from datagen.recipe import Growth
+    from datagen.store.writer import grow
+
+    append(str(spoilable), training=5)
+    late = tiny_dataset().model_copy(update={"growth": (Growth(evaluation=2),)})
+    with pytest.raises(DatasetError, match=r"another recipe \(data.growth"):
+        grow(str(spoilable), late, load_body(late.body))
+    assert open_dataset(str(spoilable)).grid.identity_count == 7
+
+
+@pytest.mark.parametrize("inside", [".git/config", "pose/thesis.txt", "identity/x", "zarr.json"])
+def test_fresh_removes_nothing_of_anybody_else(tmp_path: Path, inside: str) -> None:
+    precious = tmp_path / "mine" / inside
+    precious.parent.mkdir(parents=True)
+    precious.write_text("{}")
+    for fresh in (False, True):
+        with pytest.raises(DatasetError, match="holds what is not a dataset"):
+            generate(tiny_dataset(), str(tmp_path / "mine"), fresh=fresh)
+    assert precious.read_text() == "{}"
+
+
+def test_hidden_files_in_a_dataset_survive_its_removal(spoilable: Path) -> None:
+    (spoilable / ".notes").write_text("mine")
+    generate(OTHER, str(spoilable), fresh=True)
+    assert (spoilable / ".notes").read_text() == "mine" and open_dataset(str(spoilable)).recipe == OTHER
+
+
+@pytest.mark.parametrize("command", ["generate", "repair"])
+def test_other_code_does_not_replace_a_committed_shard(
+    spoilable: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    shard = Grid(tiny_dataset()).shards()[0]
+    (spoilable / shard_path(shard)).unlink()
+    before = tree_hash(spoilable)
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
+    with pytest.raises(DatasetError, match="was made again, but not the same"):
+        if command == "generate":
+            generate(tiny_dataset(), str(spoilable))
+        else:
+            repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+    assert not (spoilable / shard_path(shard)).exists() and tree_hash(spoilable) == before
+    monkeypatch.undo()
+    repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+
+
+def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen import generate as generation
+
+    generation._require_same_assets.cache_clear()
+    shard = Grid(tiny_dataset()).shards()[0]
+    (spoilable / shard_path(shard)).unlink()
+    monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "OTHER"),))
+    with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg OTHER"):
+        ensure_shard(str(spoilable), tiny_dataset(), shard)
+    assert not (spoilable / shard_path(shard)).exists()
+
+
+def test_a_link_to_a_dataset_is_under_the_same_lock(spoilable: Path, tmp_path: Path) -> None:
+    from datagen.store.location import writing_alone
+
+    (tmp_path / "link.zarr").symlink_to(spoilable)
+    unlock(spoilable)
+    with writing_alone(str(spoilable)):
+        for name in (str(tmp_path / "link.zarr"), f"file://{spoilable}", os.path.relpath(spoilable)):
+            with pytest.raises(DatasetError, match="another process is writing"):
+                generate(tiny_dataset(), name)
+
+
+def test_a_file_url_is_a_folder(dataset: str, tmp_path: Path) -> None:
+    generate(tiny_dataset(), f"file://{tmp_path}/x.zarr")
+    assert tree_hash(tmp_path / "x.zarr") == tree_hash(dataset)
+
+
+def test_a_lost_part_of_the_metadata_is_an_error_that_names_the_mending(spoilable: Path) -> None:
+    opened = open_dataset(str(spoilable))
+    (spoilable / "identity/0001/vertices/zarr.json").unlink()
+    (spoilable / "identity/0002/zarr.json").unlink()
+    for read in (lambda: opened.vertices(1), lambda: opened.vertex_count(1), lambda: opened.faces(2)):
+        with pytest.raises(DatasetError, match=r"missing or damaged.*--repair"):
+            read()
+    assert len(list(find_faults(str(spoilable)))) == 2
+
+
+def test_a_root_that_cannot_be_parsed_names_the_way_out(spoilable: Path) -> None:
+    (spoilable / "zarr.json").write_text((spoilable / "zarr.json").read_text()[:-40])
+    with pytest.raises(DatasetError, match=r"cannot be read.*dsffnet generate .* --fresh"):
+        open_dataset(str(spoilable))
+    assert generate(tiny_dataset(), str(spoilable), fresh=True).recipe == tiny_dataset()

@@ -1,0 +1,260 @@
+"""An object store that does not answer: asked again for a stated time, then one line; what passes leaves no trace."""
+
+import errno
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import count
+from pathlib import Path
+from threading import Thread
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from zarr.storage import FsspecStore
+
+from datagen import generate as generation
+from datagen.common.errors import DatasetError, StorageError, UnsafeFileError
+from datagen.generate import generate, inline
+from datagen.store import open_dataset, remote_objects
+from datagen.store.schema import open_group, read_bytes, write_bytes
+from datagen.store.verify import find_faults
+from tests.support.ranks import free_port
+from tests.support.recipes import tiny_dataset
+from training.data.vertex_bank import open_bank
+from workflows.cli.main import main
+
+SHARD = "identity/0001/vertices/c/0/0/0"
+
+
+@pytest.fixture
+def url(monkeypatch: pytest.MonkeyPatch) -> str:
+    """A place in memory that is reached as S3 is, with little patience."""
+    monkeypatch.setattr(remote_objects, "PATIENCE", 0.3)
+    monkeypatch.setattr(remote_objects, "_FIRST_PAUSE", 0.01)
+    return f"memory://{uuid4().hex}.zarr"
+
+
+class EndpointConnectionError(Exception):
+    """As botocore's."""
+
+
+EndpointConnectionError.__module__ = "botocore.exceptions"
+PASSING = [
+    OSError(errno.EBUSY, "Please reduce your request rate."),
+    OSError(errno.EREMOTEIO, "We encountered an internal error."),
+    ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"),
+    TimeoutError(),
+    EndpointConnectionError('Could not connect to the endpoint URL: "http://x"'),
+]
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, errors: Iterator[Exception | None]) -> None:
+    """Let requests fail with these errors, None for one that succeeds."""
+
+    def wrapped(name: str) -> None:
+        real = getattr(FsspecStore, name)
+
+        async def ask(self: FsspecStore, *arguments: Any, **options: Any) -> Any:
+            error = next(errors)
+            if error:
+                raise error
+            return await real(self, *arguments, **options)
+
+        monkeypatch.setattr(FsspecStore, name, ask)
+
+    for name in ("get", "set", "delete", "exists", "getsize"):
+        wrapped(name)
+
+
+def bytes_at(url: str) -> dict[str, bytes | None]:
+    group = open_group(url)
+    return {path: read_bytes(group, path) for path in objects_at(url)}
+
+
+def objects_at(url: str) -> list[str]:
+    from datagen.store.schema import list_objects
+
+    return list_objects(open_group(url))
+
+
+def test_errors_that_pass_lead_to_the_same_bytes(url: str, dataset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = count()
+    passing = (PASSING[n % len(PASSING)] if n % 3 == 0 else None for n in numbers)
+    failing(monkeypatch, passing)
+    made = generate(tiny_dataset(), url)
+    assert np.array_equal(made.vertices(3), open_dataset(dataset).vertices(3)) and not list(find_faults(url))
+    assert next(numbers) > 200
+    monkeypatch.undo()
+    assert bytes_at(url) == {path: (Path(dataset) / path).read_bytes() for path in objects_at(dataset)}
+
+
+@pytest.mark.parametrize("error", PASSING, ids=repr)
+def test_errors_that_stay_are_one_line_after_the_stated_time(
+    url: str, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    generate(tiny_dataset(), url)
+    opened = open_dataset(url)
+    failing(monkeypatch, iter(lambda: error, None))
+    reads = [lambda: opened.vertices(0), lambda: opened.vertices(0, 3), lambda: open_dataset(url)]
+    for read in reads:
+        began = time.monotonic()
+        with pytest.raises(StorageError, match=r"memory://.* cannot be reached.*run the same command again") as caught:
+            read()
+        assert 0.1 < time.monotonic() - began < 3 and "\n" not in str(caught.value)
+
+
+class NoCredentialsError(EndpointConnectionError):
+    """As botocore's."""
+
+
+NoCredentialsError.__module__ = "botocore.exceptions"
+
+
+@pytest.mark.parametrize("error", [PermissionError(errno.EACCES, "Access Denied"), NoCredentialsError("none")])
+def test_what_no_time_mends_is_not_waited_for(url: str, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    monkeypatch.setattr(remote_objects, "PATIENCE", 60.0)
+    failing(monkeypatch, iter(lambda: error, None))
+    with pytest.raises(StorageError, match="credentials"):
+        open_dataset(url)
+
+
+def test_an_object_that_is_longer_than_it_can_be_is_not_read(url: str) -> None:
+    generate(tiny_dataset(), url)
+    opened = open_dataset(url)
+    write_bytes(open_group(url, mode="r+"), SHARD, bytes(10**6))
+    with pytest.raises(DatasetError, match=rf"{SHARD} cannot be read .*is longer than"):
+        opened.vertices(1)
+    with pytest.raises(UnsafeFileError, match="none of its objects"):
+        read_bytes(opened.group, "../other.zarr/zarr.json")
+    assert [fault.path for fault in find_faults(url)] == [SHARD]
+
+
+# A real S3 API from here on.
+
+
+class _Proxy(BaseHTTPRequestHandler):
+    """Passes requests on to a server; every fifth is answered 503, every seventh by closing the connection."""
+
+    protocol_version = "HTTP/1.1"
+    server_address_behind = ("127.0.0.1", 0)
+    numbers = count(1)
+
+    def _pass_on(self) -> None:
+        number, length = next(self.numbers), int(self.headers.get("Content-Length") or 0)
+        body = self.rfile.read(length)
+        if number % 7 == 0:
+            self.close_connection = True
+        elif number % 5 == 0:
+            self._answer(503, {}, b"<Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>")
+        else:
+            behind = HTTPConnection(*self.server_address_behind, timeout=30)
+            headers = {name: value for name, value in self.headers.items() if name.lower() != "expect"}
+            behind.request(self.command, self.path, body, headers)
+            answer = behind.getresponse()
+            self._answer(answer.status, dict(answer.headers), answer.read())
+
+    def _answer(self, status: int, headers: dict[str, str], body: bytes) -> None:
+        self.send_response_only(status)
+        for name, value in headers.items():
+            if name.lower() not in ("transfer-encoding", "connection", "content-length"):
+                self.send_header(name, value)
+        length = headers.get("Content-Length", len(body)) if self.command == "HEAD" else len(body)
+        self.send_header("Content-Length", str(length))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = _pass_on
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """An S3 server with a bucket, and the URL of a dataset in it."""
+    import boto3
+    import s3fs
+
+    port = free_port()
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    variables = {"AWS_ACCESS_KEY_ID": "k", "AWS_SECRET_ACCESS_KEY": "s", "AWS_DEFAULT_REGION": "us-east-1"}
+    for name, value in {**variables, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()  # they know the address of the test before
+    try:
+        _make_bucket(boto3.client("s3"))
+        yield process, "s3://datasets/leg.zarr"
+    finally:
+        process.kill()
+        process.wait()
+        s3fs.S3FileSystem.clear_instance_cache()
+
+
+def _make_bucket(client: Any) -> None:
+    for attempt in count():
+        try:
+            client.create_bucket(Bucket="datasets")
+            return
+        except Exception:
+            assert attempt < 30
+            time.sleep(0.5)
+
+
+@pytest.mark.cluster
+@pytest.mark.timeout(300)
+def test_overload_and_lost_connections_of_s3_lead_to_the_same_bytes(
+    server: tuple[Any, str], dataset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, place = server
+    behind = os.environ["AWS_ENDPOINT_URL"].rsplit(":", 1)[1]
+    monkeypatch.setattr(_Proxy, "server_address_behind", ("127.0.0.1", int(behind)))
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Proxy) as proxy:
+        Thread(target=proxy.serve_forever, daemon=True).start()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{proxy.server_port}")
+        monkeypatch.setattr(remote_objects, "_FIRST_PAUSE", 0.02)
+        made = generate(tiny_dataset(), place)
+        assert np.array_equal(made.vertices(4), open_dataset(dataset).vertices(4)) and not list(find_faults(place))
+        assert bytes_at(place) == {path: (Path(dataset) / path).read_bytes() for path in objects_at(dataset)}
+        proxy.shutdown()
+
+
+@pytest.mark.cluster
+@pytest.mark.timeout(300)
+def test_s3_that_goes_away_in_the_middle(
+    server: tuple[subprocess.Popen[bytes], str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    """Of a training's reads, and of a generation: one line each, soon after the stated time."""
+    process, place = server
+    monkeypatch.setattr(remote_objects, "PATIENCE", 3.0)
+    trained_on = generate(tiny_dataset(), place)
+    bank = open_bank(trained_on, trained_on.identities("training"), cache="stream")
+
+    def killing(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        for number, row in enumerate(inline(task, arguments)):
+            if task is generation.ensure_shard and number == 2:
+                process.kill()
+                process.wait()
+            yield row
+
+    monkeypatch.setattr(generation, "inline", killing)
+    began = time.monotonic()
+    with pytest.raises(SystemExit):
+        main(["generate", "--recipe", "smoke", "--local", "--out", "s3://datasets/other.zarr"])
+    written = capsys.readouterr().err
+    errors = [line for line in written.splitlines() if line.startswith("error: ")]
+    assert "Traceback" not in written and len(errors) == 1, written
+    assert "cannot be reached" in errors[0] and "run the same command again" in errors[0]
+    with pytest.raises(StorageError, match="run the same command again"):
+        bank.batch(np.array([[0, 0, 1, 1]]))
+    assert time.monotonic() - began < 60

@@ -1,0 +1,283 @@
+"""The dataset on disk: its contract, and what happens when it is spoiled. Named after the accidents."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from datagen.common.errors import DatasetError, StorageError
+from datagen.generate import generate, make_shard, repair
+from datagen.grid import Grid
+from datagen.store import open_dataset
+from datagen.store.schema import attributes_of, open_group, shard_path
+from datagen.store.verify import describe, find_faults
+from datagen.store.writer import write_shard
+from tests.support.files import flip_bit, tree_hash, truncate
+from tests.support.layout import layout
+from tests.support.recipes import tiny_dataset
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "dataset_layout.json"
+
+
+def first_shard(url: Path) -> Path:
+    return url / shard_path(Grid(tiny_dataset()).shards()[0])
+
+
+def test_layout_on_disk_is_the_documented_one(dataset: str) -> None:
+    """Tree, shapes, dtypes, chunks, codecs. After a meant change: python -m tests.support.layout"""
+    assert layout(dataset) == json.loads(GOLDEN.read_text())
+
+
+def test_what_is_read_is_what_was_made(dataset: str) -> None:
+    opened = open_dataset(dataset)
+    grid, recipe = opened.grid, opened.recipe
+    assert recipe == tiny_dataset()
+    for shard in grid.shards():
+        vertices = opened.vertices(shard.identity, grid.rows_of(shard.identity)[shard.start : shard.stop])
+        assert np.array_equal(vertices, make_shard(recipe, shard))
+    assert np.array_equal(opened.vertices(4, 9), opened.vertices(4)[9])
+    assert np.array_equal(opened.evaluation_triples("unseen"), grid.evaluation_triples("unseen"))
+    assert opened.identities("evaluation") == [3, 4]
+
+
+def test_dimensions_are_named(dataset: str) -> None:
+    names = zarr.open_group(dataset, mode="r")["identity/0000/vertices"].metadata.dimension_names
+    assert names == ("row", "vertex", "coordinate")
+
+
+def test_making_it_twice_gives_the_same_bytes(dataset: str, tmp_path: Path) -> None:
+    generate(tiny_dataset(), str(tmp_path / "again.zarr"))
+    assert tree_hash(tmp_path / "again.zarr") == tree_hash(dataset)
+
+
+def test_a_complete_dataset_is_not_touched_again(spoilable: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in spoilable.rglob("*")}
+    generate(tiny_dataset(), str(spoilable))
+    assert {path: path.stat().st_mtime_ns for path in spoilable.rglob("*")} == before
+
+
+def test_accidental_shard_delete(spoilable: Path) -> None:
+    opened = open_dataset(str(spoilable))
+    first_shard(spoilable).unlink()
+    with pytest.raises(DatasetError, match=r"shard identity/0000/vertices/c/0/0/0 is missing.*verify .* --repair"):
+        open_dataset(str(spoilable))
+    with pytest.raises(DatasetError, match="identity/0000/vertices/c/0/0/0 is missing"):
+        opened.vertices(0)
+
+
+def test_truncated_shard(spoilable: Path) -> None:
+    truncate(first_shard(spoilable))
+    with pytest.raises(DatasetError, match=r"identity/0000.* bytes instead of"):
+        open_dataset(str(spoilable))
+
+
+@pytest.mark.parametrize("at", [0.1, 0.5, 0.999])
+def test_bit_flip_in_a_shard_is_an_error_and_never_wrong_data(spoilable: Path, at: float) -> None:
+    flip_bit(first_shard(spoilable), at=at)
+    opened = open_dataset(str(spoilable))
+    with pytest.raises(DatasetError, match=r"identity/0000/vertices/c/0/0/0 is damaged.*--repair"):
+        opened.vertices(0)
+    assert [fault.path for fault in find_faults(str(spoilable))] == ["identity/0000/vertices/c/0/0/0"]
+
+
+@pytest.mark.parametrize("spoil", [flip_bit, truncate, Path.unlink])
+def test_repair_brings_the_very_same_bytes_back_and_touches_no_other_shard(
+    dataset: str, spoilable: Path, spoil
+) -> None:
+    others = {path: path.stat().st_mtime_ns for path in spoilable.rglob("c/*/0/0")}
+    spoil(first_shard(spoilable))
+    others.pop(first_shard(spoilable))
+    repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+    assert tree_hash(spoilable) == tree_hash(dataset)
+    assert {path: path.stat().st_mtime_ns for path in others} == others
+
+
+def small_objects(url: Path) -> list[Path]:
+    files = (path for path in url.rglob("*") if path.is_file() and "/vertices/c/" not in str(path))
+    return [path for path in sorted(files) if path != url / "zarr.json"]
+
+
+@pytest.mark.parametrize("spoil", [flip_bit, Path.unlink], ids=["bit flip", "loss"])
+def test_every_other_object_that_is_spoiled_is_found_and_mended(dataset: str, spoilable: Path, spoil) -> None:
+    assert len(small_objects(spoilable)) > 30
+    for path in small_objects(spoilable):
+        spoil(path)
+        faults = list(find_faults(str(spoilable)))
+        assert [fault.path for fault in faults if not fault.shard][:1] == [str(path.relative_to(spoilable))], path
+        repair(str(spoilable), tiny_dataset(), faults)
+        assert tree_hash(spoilable) == tree_hash(dataset), path
+
+
+def test_attributes_changed_by_hand_are_refused_and_mended(dataset: str, spoilable: Path) -> None:
+    text = (spoilable / "zarr.json").read_text()
+    (spoilable / "zarr.json").write_text(text.replace('"0003": "evaluation"', '"0003": "training"', 1))
+    with pytest.raises(DatasetError, match=r"attributes \(zarr.json\) are not as they were written.*--repair"):
+        open_dataset(str(spoilable))
+    faults = list(find_faults(str(spoilable)))
+    assert [fault.path for fault in faults] == ["zarr.json"]
+    repair(str(spoilable), tiny_dataset(), faults)
+    assert tree_hash(spoilable) == tree_hash(dataset)
+
+
+def test_a_recipe_changed_by_hand_is_refused(spoilable: Path) -> None:
+    text = (spoilable / "zarr.json").read_text()
+    (spoilable / "zarr.json").write_text(text.replace('"training": 3', '"training": 2', 1))
+    with pytest.raises(DatasetError, match="attributes"):
+        open_dataset(str(spoilable))
+
+
+def test_a_manifest_that_is_not_the_committed_one(spoilable: Path) -> None:
+    manifest = spoilable / "manifest/zarr.json"
+    manifest.write_text(manifest.read_text().replace('"rows": 4', '"rows": 3', 1))
+    with pytest.raises(DatasetError, match="its manifest is not the one that was committed"):
+        open_dataset(str(spoilable))
+
+
+def test_what_a_killed_writer_left_of_a_file_is_removed(dataset: str, spoilable: Path) -> None:
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    (spoilable / "identity/0001/vertices/c/0/0/0.1234abcd.partial").write_bytes(b"half a shard")
+    generate(tiny_dataset(), str(spoilable))
+    assert tree_hash(spoilable) == tree_hash(dataset)
+
+
+def test_provenance_names_what_made_the_part_that_was_there(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.generate import append
+    from datagen.store import attributes
+
+    before = open_dataset(str(spoilable)).attributes["provenance"]
+    monkeypatch.setattr(attributes, "_git_commit", lambda: "another")
+    after = append(str(spoilable), training=4).attributes["provenance"]
+    assert after["git_commit"] == "another" and after["earlier"] == [before]
+
+
+def test_unfinished_dataset_is_refused_but_can_be_described(spoilable: Path) -> None:
+    group = open_group(str(spoilable), mode="r+")
+    group.attrs["status"] = "building"
+    first_shard(spoilable).unlink()
+    with pytest.raises(DatasetError, match="is incomplete"):
+        open_dataset(str(spoilable))
+    assert describe(str(spoilable))["shards"].startswith("11 of 12 written")
+
+
+def test_no_dataset_there(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"no dataset at .*dsffnet generate"):
+        open_dataset(str(tmp_path / "none.zarr"))
+
+
+def test_a_zarr_group_of_somebody_else(tmp_path: Path) -> None:
+    zarr.create_group(str(tmp_path / "other.zarr"))
+    with pytest.raises(DatasetError, match="not a dataset of this project"):
+        open_dataset(str(tmp_path / "other.zarr"))
+
+
+def test_metadata_that_is_not_json(spoilable: Path) -> None:
+    (spoilable / "zarr.json").write_text("{ not json")
+    with pytest.raises(DatasetError, match="not a readable dataset"):
+        open_dataset(str(spoilable))
+
+
+def test_format_version_from_the_future(spoilable: Path) -> None:
+    open_group(str(spoilable), mode="r+").attrs["format_version"] = 99
+    with pytest.raises(DatasetError, match="format version 99, this program reads 2; update"):
+        open_dataset(str(spoilable))
+
+
+def test_recipe_changed_between_runs(spoilable: Path) -> None:
+    before = tree_hash(spoilable)
+    changed = tiny_dataset(identities={"training": 3, "evaluation": 2, "seed": 5})
+    with pytest.raises(DatasetError, match=r"another recipe \(data.identities.seed: 0 there, 5 here\).*--fresh"):
+        generate(changed, str(spoilable))
+    assert tree_hash(spoilable) == before
+    generate(changed, str(spoilable), fresh=True)
+    assert open_dataset(str(spoilable)).recipe == changed
+
+
+def test_fresh_never_removes_what_is_not_a_dataset(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(DatasetError, match="holds what is not a dataset"):
+        generate(tiny_dataset(), str(tmp_path), fresh=True)
+    assert (tmp_path / "thesis.txt").read_text() == "precious"
+
+
+def test_disk_full_is_one_error_and_earlier_shards_stay(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import zarr.storage._local as local
+
+    shard = Grid(tiny_dataset()).shards()[1]
+    (spoilable / shard_path(shard)).unlink()
+    before = tree_hash(spoilable)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(local, "_put", full)
+    with pytest.raises(StorageError, match="No space left on device"):
+        write_shard(str(spoilable), tiny_dataset(), shard, make_shard(tiny_dataset(), shard))
+    monkeypatch.undo()
+    assert tree_hash(spoilable) == before
+
+
+def test_the_uuid_says_whether_two_datasets_hold_the_same(dataset: str, tmp_path: Path) -> None:
+    same = generate(tiny_dataset(), str(tmp_path / "same.zarr"))
+    other = generate(tiny_dataset(triples={"count": 6}), str(tmp_path / "other.zarr"))
+    assert open_dataset(dataset).uuid == same.uuid != other.uuid
+
+
+def test_statistics_are_those_of_all_meshes(dataset: str) -> None:
+    opened = open_dataset(dataset)
+    everything = np.concatenate([opened.vertices(i).reshape(-1, 3) for i in range(5)])
+    statistics = attributes_of(opened.group)["statistics"]
+    assert np.allclose(statistics["minimum"], everything.min(0)) and np.allclose(
+        statistics["maximum"], everything.max(0)
+    )
+    assert statistics["meshes"] == opened.grid.mesh_count == 38
+
+
+def test_made_in_part_then_copied_elsewhere_it_is_finished_there(dataset: str, spoilable: Path, tmp_path: Path) -> None:
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    shutil.rmtree(spoilable / "manifest")
+    shutil.rmtree(spoilable / "identity" / "0003")
+    moved = tmp_path / "moved.zarr"
+    shutil.move(spoilable, moved)
+    generate(tiny_dataset(), str(moved))
+    assert tree_hash(moved) == tree_hash(dataset)
+
+
+def test_a_dataset_is_never_written_among_other_files_nor_removed_with_them(dataset: str, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(DatasetError, match=r"holds what is not a dataset \(thesis.txt\)"):
+        generate(tiny_dataset(), str(tmp_path))
+    made = tmp_path / "leg.zarr"
+    shutil.copytree(dataset, made)
+    (made / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match=r"notes.txt"):
+        generate(tiny_dataset(), str(made), fresh=True)
+    assert (made / "notes.txt").exists() and (tmp_path / "thesis.txt").exists()
+
+
+def test_a_file_where_the_dataset_should_go(tmp_path: Path) -> None:
+    (tmp_path / "x.zarr").write_text("a file")
+    with pytest.raises(DatasetError, match="is a file"):
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), fresh=True)
+
+
+def test_repair_refuses_to_commit_other_bytes(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.bodies.leg import LegModel
+
+    first_shard(spoilable).unlink()
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
+    with pytest.raises(DatasetError, match="was made again, but not the same"):
+        repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+
+
+def test_other_assets_are_refused_when_going_on(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from datagen.bodies.leg import LegModel
+    from datagen.common.assets import Asset
+
+    open_group(str(spoilable), mode="r+").attrs["status"] = "building"
+    monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "2"),))
+    with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg 2"):
+        generate(tiny_dataset(), str(spoilable))

@@ -1,0 +1,210 @@
+"""Batches: the right meshes, edges of one topology or many, and augmentation that depends on nothing but its place."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from datagen.common.errors import DatasetError
+from datagen.generate import generate
+from datagen.mesh.geometry import bounding_box, edges_of
+from datagen.store import Dataset, open_dataset
+from tests.support.mixed import MIXED_COUNTS, mixed_dataset
+from tests.support.recipes import tiny_training
+from training.data.augmentation import Augmentation, Shuffle
+from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
+from training.data.triples import TripleOrder
+from training.data.vertex_bank import open_bank
+from training.networks.dsffnet import DSFFNet
+from training.networks.padded_batches import MixedCounts
+from training.objectives.edge_incidence import INCIDENCES, incidence_of, make_incidence
+
+TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [4, 2, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return open_dataset(generate(mixed_dataset(), str(tmp_path_factory.mktemp("mixed") / "legs.zarr")).url)
+
+
+def unit(dataset: Dataset, identity: int, pose: int) -> torch.Tensor:
+    vertices = dataset.vertices(identity, pose)
+    return torch.from_numpy(bounding_box(vertices).normalise(vertices))
+
+
+def same(one: Batch, other: Batch) -> bool:
+    pairs = ((one.source, other.source), (one.target, other.target), (one.truth, other.truth))
+    counts = (one.source_counts, one.target_counts) == (other.source_counts, other.target_counts)
+    return counts and all(torch.equal(a, b) for a, b in pairs) and same_edges(one.edges, other.edges)
+
+
+def same_edges(one: torch.Tensor | PackedEdges, other: torch.Tensor | PackedEdges) -> bool:
+    if isinstance(one, PackedEdges) and isinstance(other, PackedEdges):
+        return torch.equal(one.pairs, other.pairs) and torch.equal(one.meshes, other.meshes)
+    return isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor) and torch.equal(one, other)
+
+
+def test_batches_hold_the_right_normalised_meshes(dataset: str) -> None:
+    opened = open_dataset(dataset)
+    triples = np.array([[3, 8, 4, 1], [4, 0, 3, 9]])
+    batch = open_bank(opened, opened.identities("evaluation")).batch(triples)
+    for row, (source, source_pose, target, target_pose) in enumerate(triples.tolist()):
+        assert torch.equal(batch.source[row], unit(opened, source, source_pose))
+        assert torch.equal(batch.target[row], unit(opened, target, target_pose))
+        assert torch.equal(batch.truth[row], unit(opened, target, source_pose)), "target's identity in source's pose"
+    assert batch.truth.abs().max() <= 1 + 1e-6
+    assert torch.equal(batch.edges, torch.from_numpy(edges_of(opened.faces(3))))
+    assert batch.source_counts is None and batch.target_counts is None
+    assert same(batch, read_batch(opened, triples))
+
+
+def test_meshes_of_many_counts_are_padded_with_zeros(mixed: Dataset) -> None:
+    batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    assert batch.source_counts == (32, 30, 30, 30) and batch.target_counts == (30, 30, 32, 32)
+    assert batch.source.shape == batch.target.shape == batch.truth.shape == (4, 32, 3)
+    for row, (source, source_pose, target, target_pose) in enumerate(TRIPLES.tolist()):
+        for meshes, identity, pose in (
+            (batch.source, source, source_pose),
+            (batch.target, target, target_pose),
+            (batch.truth, target, source_pose),
+        ):
+            count = MIXED_COUNTS[identity % 3]
+            assert torch.equal(meshes[row, :count], unit(mixed, identity, pose))
+            assert (meshes[row, count:] == 0).all()
+    assert same(batch, read_batch(mixed, TRIPLES, padded=True))
+    assert len(MixedCounts(DSFFNet(encoder_widths=(4, 4, 4), decoder_widths=(4, 4, 4)))(
+        source=batch.source, target=batch.target, source_counts=batch.source_counts, target_counts=batch.target_counts
+    )) == 4  # fmt: skip
+
+
+def test_a_batch_of_equal_counts_and_one_topology_is_a_plain_one_in_any_bank(mixed: Dataset) -> None:
+    bank = open_bank(mixed, mixed.identities("training"))
+    batch = bank.batch(np.array([[1, 0, 4, 1], [2, 2, 1, 3]]))
+    assert batch.source_counts is None and batch.target_counts is None and batch.target.shape == (2, 30, 3)
+    assert torch.equal(batch.edges, torch.from_numpy(edges_of(mixed.faces(1))))
+    other = bank.batch(np.array([[4, 0, 1, 1], [1, 2, 2, 3]]))
+    assert other.target_counts is None and isinstance(other.edges, PackedEdges), "equal counts, other faces"
+
+
+def test_packed_edges_are_each_meshs_own_edges(mixed: Dataset) -> None:
+    batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    assert isinstance(batch.edges, PackedEdges)
+    flat = batch.truth.reshape(-1, 3)
+    packed = (flat[batch.edges.pairs[:, 0]] - flat[batch.edges.pairs[:, 1]]).norm(dim=1)
+    for row, (_, source_pose, target, _) in enumerate(TRIPLES.tolist()):
+        first, second = torch.from_numpy(edges_of(mixed.faces(target))).T
+        mesh = unit(mixed, target, source_pose)
+        assert torch.equal(packed[batch.edges.meshes == row], (mesh[first] - mesh[second]).norm(dim=1))
+    assert (batch.edges.meshes.diff() >= 0).all()
+
+
+def test_how_packed_edges_touch_is_known_without_sorting_them(mixed: Dataset) -> None:
+    """Put together from each topology's, it is what sorting the batch's edges gives, to the order of every sum."""
+    bank = open_bank(mixed, mixed.identities("training"))
+    batches = [bank.batch(triples) for triples in (TRIPLES, TRIPLES[::-1], TRIPLES[:3])]
+    for batch in batches:
+        assert isinstance(batch.edges, PackedEdges)
+        rows = batch.target.shape[0] * batch.target.shape[1]
+        found = INCIDENCES[batch.edges.pairs]
+        assert incidence_of(batch.edges.pairs, rows) is found
+        for one, other in zip(found, make_incidence(batch.edges.pairs, rows), strict=True):
+            assert torch.equal(one, other) and one.dtype == other.dtype
+
+
+def test_edges_of_faces_have_the_mean_of_the_faces_sums(mixed: Dataset) -> None:
+    sides = EdgeTable(mixed, [0], device="cpu", of="faces").of(np.array([0]), rows=32)
+    assert isinstance(sides, torch.Tensor)
+    mesh = unit(mixed, 0, 0)
+    corners = mesh[torch.from_numpy(mixed.faces(0)).long()]
+    sums = (corners - corners.roll(-1, dims=1)).norm(dim=2).sum(dim=1)
+    means = (mesh[sides[:, 0]] - mesh[sides[:, 1]]).norm(dim=1).mean()
+    torch.testing.assert_close(3 * means, sums.mean())
+
+
+def test_part_of_a_batch_is_the_batch_of_those_triples(mixed: Dataset) -> None:
+    """Its edges too, whose rows count from the part's first mesh."""
+    whole = read_batch(mixed, TRIPLES, padded=True)
+    part = whole.part(1, 3)
+    assert len(part) == 2 and isinstance(whole.edges, PackedEdges) and isinstance(part.edges, PackedEdges)
+    rows = whole.target.shape[1]
+    flat, of_part = whole.target.reshape(-1, 3), part.target.reshape(-1, 3)
+    inside = (whole.edges.meshes >= 1) & (whole.edges.meshes < 3)
+    assert torch.equal(of_part[part.edges.pairs], flat[whole.edges.pairs[inside]])
+    assert torch.equal(part.edges.meshes, part.edges.pairs[:, 0] // rows)
+    assert part.target_counts == whole.target_counts[1:3] and torch.equal(part.truth, whole.truth[1:3])
+
+
+def test_reading_mixed_counts_must_be_asked_for(mixed: Dataset) -> None:
+    with pytest.raises(DatasetError, match=r"mixes vertex counts \(30 to 32\)"):
+        read_batch(mixed, TRIPLES)
+
+
+def augmented(mixed: Dataset, *, step: int, ranks: int = 1, parts: int = 1, **changes: float) -> Iterator[Batch]:
+    """The batch of a step as all ranks and parts have it, mesh by mesh."""
+    identities = mixed.identities("training")
+    order = TripleOrder(identities, mixed.grid.poses("seen"), batch=8, seed=1)
+    augment, bank = Augmentation(tiny_training(augmentation=changes, seed=1)), open_bank(mixed, identities)
+    for rank in range(ranks):
+        share = {"rank": rank, "ranks": ranks, "parts": parts}
+        first_places, triples = order.places(**share), next(order.batches(first_step=step, **share))
+        for first, part in zip(first_places, triples, strict=True):
+            yield augment(bank.batch(part), step=step, first=first)
+
+
+def sources(batches: Iterator[Batch]) -> list[np.ndarray]:
+    found = []
+    for batch in batches:
+        counts = batch.source_counts or [batch.source.shape[1]] * len(batch.source)
+        found += [mesh[:count].numpy() for mesh, count in zip(batch.source, counts, strict=True)]
+    return found
+
+
+@pytest.mark.parametrize(("ranks", "parts"), [(2, 1), (1, 4), (2, 2)])
+def test_augmentation_is_the_same_for_any_ranks_and_parts(mixed: Dataset, ranks: int, parts: int) -> None:
+    changes = {"vertices": 0.5, "source_noise": 0.1}
+    alone = sources(augmented(mixed, step=3, **changes))
+    shared = sources(augmented(mixed, step=3, ranks=ranks, parts=parts, **changes))
+    assert len(alone) == 8 and all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
+
+
+def test_subsets_are_rows_of_the_source_in_its_order_and_others_each_time(mixed: Dataset) -> None:
+    whole, subsets = (sources(augmented(mixed, step=2, vertices=part)) for part in (1.0, 0.5))
+    chosen = []
+    for mesh, subset in zip(whole, subsets, strict=True):
+        assert len(subset) == round(0.5 * len(mesh))
+        rows = [int(np.flatnonzero((mesh == vertex).all(axis=1))[0]) for vertex in subset]
+        assert sorted(rows) == rows and len(set(rows)) == len(rows)
+        chosen.append(tuple(rows))
+    assert len(set(chosen)) == len(chosen), "another subset for every mesh"
+    (batch,) = augmented(mixed, step=2, vertices=0.5)
+    (plain,) = augmented(mixed, step=2)
+    assert batch.source_counts is not None and batch.source.shape[1] == max(batch.source_counts)
+    assert torch.equal(batch.target, plain.target) and torch.equal(batch.truth, plain.truth)
+
+
+def test_noise_has_its_deviation_and_changes_from_step_to_step(mixed: Dataset) -> None:
+    def noise(step: int) -> np.ndarray:
+        plain, noisy = (sources(augmented(mixed, step=step, source_noise=amount)) for amount in (0.0, 0.2))
+        return np.concatenate(noisy) - np.concatenate(plain)
+
+    assert noise(0).std() == pytest.approx(0.2, rel=0.15) and abs(noise(0).mean()) < 0.03
+    assert len({float(noise(step)[0, 0]) for step in range(3)}) == 3
+
+
+def test_without_augmentation_the_batch_is_left_alone(mixed: Dataset) -> None:
+    batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    assert Augmentation(tiny_training())(batch, step=0, first=0) is batch
+
+
+def test_a_shuffled_batch_lists_each_targets_own_vertices_in_another_order_and_back(mixed: Dataset) -> None:
+    batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    assert batch.target_counts is not None
+    shuffle, later = (Shuffle(batch, seed=1, step=step) for step in (5, 6))
+    shuffled = shuffle(batch.target)
+    for mesh, other, count in zip(batch.target, shuffled, batch.target_counts, strict=True):
+        assert not torch.equal(mesh[:count], other[:count]) and torch.equal(mesh[count:], other[count:])
+        assert sorted(map(tuple, mesh[:count].tolist())) == sorted(map(tuple, other[:count].tolist()))
+    assert torch.equal(shuffle.undone(shuffled), batch.target)
+    assert not torch.equal(later(batch.target), shuffled), "another order at each step"
+    assert torch.equal(Shuffle(batch, seed=1, step=5)(batch.target), shuffled), "the same order for every rank and part"

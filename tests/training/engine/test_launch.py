@@ -1,0 +1,153 @@
+"""Launching: restarts by progress, the budget over restarts, GPUs of the cluster, recipes from a file and words."""
+
+import json
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+import yaml
+
+from datagen.common.errors import RecipeError, TrainingError
+from tests.support.ranks import ROOT
+from tests.support.recipes import tiny_training
+from training.checkpoints.checkpoint import require_checkpoint
+from training.engine import launch
+from training.engine.distributed import STOP_FILE, BudgetSpent
+from training.recipes.files import recipe_in
+
+
+class Dying:
+    """Ray's ``fit`` that uses up its restarts again and again; ``steps``: the checkpoint each call gets to."""
+
+    def __init__(self, run: Path, steps: list[int | None]) -> None:
+        self._run, self._steps, self.calls = run, steps, 0
+
+    def __call__(self) -> None:
+        step = self._steps[self.calls]
+        self.calls += 1
+        if step is None:
+            raise RuntimeError("a node was lost")
+        (self._run / "checkpoints" / f"step-{step:08d}").mkdir(parents=True)
+        if self.calls < len(self._steps):
+            raise RuntimeError("a node was lost")
+
+
+def test_ranks_that_die_with_progress_are_started_again_and_again(tmp_path: Path) -> None:
+    fit = Dying(tmp_path, [10, 20, 30, 40, 50, 60, 70])
+    launch._fit(fit, tmp_path)
+    assert fit.calls == 7
+
+
+@pytest.mark.parametrize("left_over", [None, STOP_FILE, "failure.json"])
+def test_without_progress_or_told_to_stop_or_with_something_to_mend_it_ends(
+    tmp_path: Path, left_over: str | None
+) -> None:
+    fit = Dying(tmp_path, [10, None, 20] if left_over is None else [10, 20, 30])
+    if left_over:
+        (tmp_path / left_over).touch()
+    with pytest.raises(RuntimeError, match="a node was lost"):
+        launch._fit(fit, tmp_path)
+    assert fit.calls == (2 if left_over is None else 1)
+
+
+@pytest.mark.parametrize(
+    ("ago", "steps"), [(300, 8), (6000, 1), (-60, 8)], ids=["half spent", "spent", "clocks differ"]
+)
+def test_the_budget_counts_from_the_drivers_start(dataset: str, tmp_path: Path, ago: float, steps: int) -> None:
+    """Restarts included; and a group that comes too late still learns a step."""
+    recipe, run = tiny_training(budget="10min"), tmp_path / "run"
+    config = {"recipe": recipe.model_dump(mode="json"), "data": dataset, "run": str(run), "mark": "its"}
+    run.mkdir()
+    (run / ".launch").write_text("its")
+    late = pytest.raises(BudgetSpent, match="budget of 10min is spent at step 1 of 8") if steps == 1 else nullcontext()
+    with late:
+        launch._rank(config | {"began": time.time() - ago})
+    assert require_checkpoint(run).step == steps
+
+
+@pytest.mark.parametrize(
+    ("changes", "gpus", "torch_sees_them", "expected"),
+    [
+        ({"ranks": 4}, 4, True, True),
+        ({"ranks": 4}, 3, True, False),
+        ({"ranks": 4, "fewest_ranks": 2}, 3, True, True),
+        ({"ranks": 4}, 4, False, False),
+        ({"ranks": 1, "device": "cuda"}, 0, False, True),
+        ({"ranks": 1, "device": "cpu"}, 4, True, False),
+    ],
+)
+def test_gpus_are_the_clusters(
+    changes: dict[str, int], gpus: int, torch_sees_them: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "_cluster", {"GPU": gpus, "CPU": 1}.get)
+    monkeypatch.setattr(launch, "_torch_there_uses_gpus", lambda: torch_sees_them)
+    recipe = tiny_training(**{"launcher": "ray", "device": "auto"} | changes)
+    assert launch._on_gpus(recipe) == expected
+
+
+@pytest.mark.parametrize(("changes", "key"), [({}, "ranks is 4"), ({"fewest_ranks": 3}, "fewest_ranks is 3")])
+def test_too_few_machines_are_said_by_the_key_that_asks(
+    changes: dict[str, int], key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "_cluster", lambda _: 2)
+    recipe = tiny_training(launcher="ray", ranks=4, **changes)
+    with pytest.raises(TrainingError, match=rf"training\.{key}, but the cluster has 2 CPUs"):
+        launch._require(recipe, "CPU")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("suffix", ["yaml", "json"])
+def test_a_section_or_a_whole_recipe_with_words(tmp_path: Path, whole: bool, suffix: str) -> None:
+    section = tiny_training().model_dump(mode="json")
+    values = {"description": "", "data": {}, "training": section} if whole else section
+    path = tmp_path / f"recipe.{suffix}"
+    path.write_text(json.dumps(values) if suffix == "json" else yaml.safe_dump(values))
+    words = ["budget=9min", "training.steps=100", "network.encoder_widths=[4,4,4]", "gradient_clip=null"]
+    words += ["schedule.decay=0.5", "learning_rate=1e-3"]
+    found = recipe_in(path, words)
+    assert (found.budget, found.steps, found.gradient_clip, found.learning_rate) == ("9min", 100, None, 0.001)
+    assert found.schedule.decay == 0.5 and found.schedule.name == "one_cycle"
+    assert found.network == tiny_training(network=section["network"] | {"encoder_widths": [4, 4, 4]}).network
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "says"),
+    [
+        ("batch: 0\nstepz: 3", [], r"batch: .* \(given: 0\); stepz: Extra inputs.* \(given: 3\)"),
+        ("batch: 4", ["ranks=3"], "batch 4 cannot be shared equally by 3 ranks"),
+        ("batch: 4", ["ranks"], "'ranks' is not of the form section.key=value"),
+        ("training: npt-paper", [], "names the training recipe 'npt-paper'"),
+        ("- 1", [], "it holds list, not keys"),
+        ("a: [", [], "cannot be read: .*line 2"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_one_line_with_every_fault(
+    tmp_path: Path, text: str, words: list[str], says: str
+) -> None:
+    (tmp_path / "r.yaml").write_text(text)
+    with pytest.raises(RecipeError, match=says):
+        recipe_in(tmp_path / "r.yaml", words)
+    with pytest.raises(RecipeError, match=r"none.yaml cannot be read"):
+        recipe_in(tmp_path / "none.yaml")
+
+
+def test_the_command(tmp_path: Path, dataset: str) -> None:
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "training", *map(str, arguments)]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+
+    (tmp_path / "r.json").write_text(json.dumps({"training": tiny_training().model_dump(mode="json")}))
+    done = run(tmp_path / "r.json", dataset, tmp_path / "run", "steps=4", "schedule.name=constant")
+    assert done.returncode == 0, done.stderr
+    assert require_checkpoint(tmp_path / "run").step == 4
+    (tmp_path / "file").write_text("in the way")
+    for arguments, status in (
+        ((tmp_path / "r.json", dataset, tmp_path / "file"), 1),
+        ((tmp_path / "none.json", dataset, tmp_path / "run"), 2),
+    ):
+        failed = run(*arguments)
+        lines = [line for line in failed.stderr.splitlines() if line.startswith("error: ")]
+        assert failed.returncode == status and len(lines) == 1 and "Traceback" not in failed.stderr, failed.stderr

@@ -1,0 +1,140 @@
+"""Frames pass one by one: where each stands, how they are smoothed, and how little of them is held."""
+
+import tracemalloc
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+from torch import Tensor, nn
+
+from datagen.common.errors import MeshError
+from datagen.mesh.geometry import Mesh, bounding_box
+from training.inference.orientation import Axes
+from training.inference.placement import standing_point
+from training.inference.smoothing import smoothed
+from training.inference.transfer import PoseTransfer
+from training.networks import build_network
+
+FACES = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
+
+
+class Copier(nn.Module):
+    """Returns the source's vertices, as if source and target had one identity."""
+
+    def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        return source
+
+
+@pytest.fixture
+def transfer() -> PoseTransfer:
+    torch.manual_seed(0)
+    return PoseTransfer(build_network("dsffnet", encoder_widths=(8, 16, 32), decoder_widths=(16, 32, 16)))
+
+
+def mesh_of(seed: int, count: int = 40) -> Mesh:
+    random = np.random.default_rng(seed)
+    return Mesh(random.normal(size=(count, 3)) * (1, 2, 0.7), random.integers(0, count, (60, 3)))
+
+
+def test_a_sequence_of_one_is_a_call(transfer: PoseTransfer) -> None:
+    source, target = mesh_of(1), mesh_of(2)
+    (only,) = transfer.sequence([source], target, smooth=9)
+    assert np.array_equal(only.vertices, transfer(source=source, target=target).vertices)
+
+
+def test_the_output_stands_on_the_ground_of_the_target() -> None:
+    target = Mesh(np.array([[5.0, 3, 1], [6, 3, 1], [5, 5, 1], [6, 5, 1], [5, 5, 2]]), FACES)
+    sitting = Mesh(target.vertices * (1, 0.4, 1), FACES)
+    posed = PoseTransfer(Copier())(source=sitting, target=target)
+    assert np.allclose(standing_point(posed.vertices), standing_point(target.vertices))
+    assert bounding_box(posed.vertices).centre[1] < bounding_box(target.vertices).centre[1] - 0.3
+
+
+def test_the_way_through_space_is_kept_at_the_size_of_the_target() -> None:
+    """The target is the source's body, three times as large: its steps are three times as long."""
+    body = mesh_of(3)
+    steps = np.array([[0, 0, 0], [0.5, 0, 0], [1, 0.7, 0.2]])
+    target = Mesh(body.vertices * 3 + 10, body.faces)
+    posed = PoseTransfer(Copier()).sequence([Mesh(body.vertices + step, body.faces) for step in steps], target)
+    for step, frame in zip(steps, posed, strict=True):
+        assert np.allclose(frame.vertices, target.vertices + 3 * step, atol=1e-5)
+
+
+def test_meshes_that_stand_otherwise_come_back_in_their_own_axes(transfer: PoseTransfer) -> None:
+    source, target, of_source, of_target = mesh_of(1), mesh_of(2), Axes("Z", "-Y"), Axes("-X", "Y")
+    expected = transfer(source=source, target=target)
+    turned = {"source": Mesh(of_source.restored(source.vertices), source.faces),
+              "target": Mesh(of_target.restored(target.vertices), target.faces)}  # fmt: skip
+    found = transfer(**turned, source_axes=of_source, target_axes=of_target)
+    assert np.allclose(found.vertices, of_target.restored(expected.vertices), atol=1e-5)
+
+
+def test_refining_changes_the_output_and_nothing_else(transfer: PoseTransfer) -> None:
+    source, target = mesh_of(1), mesh_of(2)
+    plain, refined = transfer(source=source, target=target), transfer(source=source, target=target, refine=4.0)
+    assert abs(plain.vertices - refined.vertices).max() > 1e-3 and np.array_equal(refined.faces, target.faces)
+
+
+def test_a_broken_frame_is_named(transfer: PoseTransfer) -> None:
+    broken = Mesh(np.full((4, 3), np.nan), FACES[:1])
+    frames = transfer.sequence([mesh_of(1), broken], mesh_of(2))
+    next(frames)
+    with pytest.raises(MeshError, match="source 1"):
+        next(frames)
+
+
+def test_a_mesh_that_comes_back_has_no_error_onto_itself() -> None:
+    meshes = np.random.default_rng(0).uniform(-1, 1, (5, 30, 3))
+    assert np.allclose(PoseTransfer(Copier()).self_errors(meshes), 0)
+
+
+class TestSmoothing:
+    """As scipy.signal.savgol_filter over the whole sequence, from a window of it."""
+
+    @pytest.mark.parametrize("count", [5, 6, 7, 30])
+    def test_it_is_the_filter_over_the_whole_sequence(self, count: int) -> None:
+        frames = np.random.default_rng(0).normal(size=(count, 4, 3))
+        found = np.stack(list(smoothed(iter(frames), 5)))
+        assert np.allclose(found, savgol_filter(frames, 5, 2, axis=0, mode="interp"))
+
+    @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 6])
+    def test_a_sequence_shorter_than_the_window_is_smoothed_over_its_length(self, count: int) -> None:
+        time = np.linspace(0, 1, count)[:, None, None]
+        arc = np.concatenate([time, time**2, 1 - time], axis=-1)
+        found = list(smoothed(iter(arc), 9))
+        assert len(found) == count and all(np.allclose(*pair) for pair in zip(found, arc, strict=True))
+
+    def test_a_swinging_limb_keeps_its_length_and_loses_its_jitter(self) -> None:
+        angle = np.linspace(0, 2, 60)
+        clean = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)[:, None]
+        jitter = np.random.default_rng(0).normal(0, 0.02, clean.shape)
+        found = np.stack(list(smoothed(iter(clean + jitter), 11)))
+        assert abs(np.stack(list(smoothed(iter(clean), 11))) - clean).max() < 1e-3
+        assert np.std(np.diff(found - clean, axis=0)) < 0.35 * np.std(np.diff(jitter, axis=0))
+
+    @pytest.mark.parametrize("window", [0, 1, 3])
+    def test_a_small_window_smooths_nothing(self, window: int) -> None:
+        frames = np.random.default_rng(0).normal(size=(6, 4, 3))
+        assert np.array_equal(np.stack(list(smoothed(iter(frames), window))), frames)
+
+
+def test_a_hundred_frames_take_no_more_memory_than_ten(transfer: PoseTransfer) -> None:
+    def frames(count: int) -> Iterator[Mesh]:
+        random = np.random.default_rng(0)
+        return (Mesh(random.normal(size=(3000, 3)), FACES) for _ in range(count))
+
+    def peak(count: int) -> int:
+        tracemalloc.start()
+        try:
+            for _ in transfer.sequence(frames(count), mesh_of(2, count=3000), smooth=5):
+                pass
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(2)
+    one_frame: NDArray[np.float64] = np.zeros((3000, 3))
+    assert peak(100) < peak(10) + 10 * one_frame.nbytes

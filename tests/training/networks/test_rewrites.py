@@ -1,0 +1,122 @@
+"""Each algebraic rewrite of the networks alone, against what it replaces, in float64."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv1d, instance_norm, linear
+
+from tests.literal.corenet3d import LiteralElaIN
+from tests.literal.dsffnet import LiteralNorm
+from tests.support.three_networks import FORMS, LITERAL, lively, meshes, pair
+from training.networks.dsffnet import DSFFNet, _joined
+from training.networks.layers.elain import ElaIN, Generator, Identity, centred
+from training.networks.layers.modulation import FFAdaIN, affine_map, homogeneous, pose_probe, posed_map
+from training.networks.layers.pose_encoder import PoseEncoder, centred_features, normalised_linear
+
+EXACT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+@pytest.fixture(autouse=True)
+def _float64() -> None:
+    torch.set_default_dtype(torch.float64)
+    torch.manual_seed(0)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def _mesh(vertices: int, seed: int = 1) -> Tensor:
+    return meshes(vertices, seed=seed, dtype=torch.float64)
+
+
+def _by_channel(features: Tensor) -> Tensor:
+    """Instance norm of ``[b, n, c]``."""
+    return instance_norm(features.transpose(1, 2)).transpose(1, 2)
+
+
+def test_a_linear_layer_of_pose_and_vertex_is_one_affine_map_a_mesh() -> None:
+    layer, latent, vertices = nn.Linear(7 + 3, 5), torch.randn(2, 7), _mesh(9)
+    mixed = torch.cat([latent.unsqueeze(1).expand(-1, 9, -1), vertices], dim=2)
+    torch.testing.assert_close(homogeneous(vertices) @ posed_map(layer, pose_probe(latent)), layer(mixed), **EXACT)
+    own = nn.Linear(3, 5)
+    torch.testing.assert_close(homogeneous(vertices) @ affine_map(own), own(vertices), **EXACT)
+
+
+@pytest.mark.parametrize(("fusion", "target_side"), [(True, True), (False, True), (True, False)])
+def test_both_branches_of_ffadain_are_two_maps_a_mesh(fusion: bool, target_side: bool) -> None:
+    norm = FFAdaIN(channels=5, latent=7, fusion=fusion, target_side=target_side)
+    literal = LiteralNorm(5, 7, fusion, target_side)
+    for parameter in norm.parameters():
+        nn.init.normal_(parameter)
+    own = literal.state_dict()
+    literal.load_state_dict({name: value.reshape(own[name].shape) for name, value in norm.state_dict().items()})
+    hidden, vertices, latent = torch.randn(2, 9, 5), _mesh(9), torch.randn(2, 7)
+    scale, shift = norm(pose_probe(latent))
+    found = _by_channel(hidden) * (homogeneous(vertices) @ scale) + homogeneous(vertices) @ shift
+    mixed = torch.cat([latent.unsqueeze(2).expand(-1, -1, 9), vertices.transpose(1, 2)], dim=1)
+    expected = literal(hidden.transpose(1, 2), vertices.transpose(1, 2), mixed).transpose(1, 2)
+    torch.testing.assert_close(found, expected, **EXACT)
+
+
+def test_a_norm_after_a_linear_layer_is_a_linear_layer_a_mesh_and_ignores_the_bias() -> None:
+    layer, features = nn.Linear(6, 5), torch.randn(2, 11, 6)
+    found = centred_features(features) @ normalised_linear(layer.weight, centred_features(features))
+    torch.testing.assert_close(found, _by_channel(layer(features)), **EXACT)
+
+
+def test_the_encoders_maximum_goes_through_norm_and_relu() -> None:
+    encoder, source = PoseEncoder((6, 8, 12)), _mesh(30)
+    torch.testing.assert_close(encoder(source), encoder.features(source).amax(dim=1), **EXACT)
+    hidden = source
+    for layer in encoder.linear_layers():
+        hidden = torch.relu(_by_channel(layer(hidden)))
+    torch.testing.assert_close(encoder(source), hidden.amax(dim=1), **EXACT)
+
+
+def test_dsffnets_first_layer_norm_and_relu_are_quadratic_in_the_coordinates() -> None:
+    network = lively("dsffnet").double()
+    assert isinstance(network, DSFFNet)
+    decoder, target, probe = network.decoder, _mesh(11), pose_probe(torch.randn(2, 24))
+    scale, shift = decoder.block1.norm1(probe)
+    vertices = homogeneous(target)
+    expected = torch.relu(_by_channel(decoder.lift(target)) * (vertices @ scale) + vertices @ shift)
+    torch.testing.assert_close(decoder._lifted(target, vertices, probe), expected, **EXACT)
+
+
+@pytest.mark.parametrize("outputs", [3, 6, 9])
+def test_a_blocks_last_layer_merges_with_the_next(outputs: int) -> None:
+    first, second, weight, following = (torch.randn(s) for s in ((2, 7, 6), (2, 7, 6), (6, 6), (outputs, 6)))
+    torch.testing.assert_close(
+        _joined(first, second, weight, following), (first + second @ weight.t()) @ following.t(), **EXACT
+    )
+
+
+def test_elain_is_two_affine_maps_of_the_identity_feature_a_mesh() -> None:
+    norm, literal = ElaIN(5, 4), LiteralElaIN(5, 4)
+    pairs = {"side": "mlp_same", "scale": "mlp_gamma", "shift": "mlp_beta", "blend": "mlp_weight"}
+    for mine, released in pairs.items():
+        layer, copy = norm.get_submodule(mine), literal.get_submodule(released)
+        copy.load_state_dict({"weight": layer.weight.unsqueeze(2), "bias": layer.bias})
+    hidden, identity, constant = torch.randn(2, 9, 5), torch.randn(2, 9, 4), torch.randn(5)
+    found = norm(centred(hidden, constant), Identity.of(identity))
+    expected = literal((hidden + constant).transpose(1, 2), identity.transpose(1, 2)).transpose(1, 2)
+    torch.testing.assert_close(found, expected, **EXACT)
+
+
+def test_3d_corenets_wide_convolution_and_the_next_layer_are_one_map_of_nine_numbers() -> None:
+    generator, warped = Generator((12, 8, 6), 4), _mesh(10)
+    found = generator._lifted(warped)
+    weight = generator.lift.weight.view(12, 3, 3)
+    lifted = conv1d(warped.transpose(1, 2), weight, generator.lift.bias, padding=1).transpose(1, 2)
+    expected = linear(lifted, generator.linear1.weight, generator.linear1.bias)
+    torch.testing.assert_close(found.values + found.mean, expected, **EXACT)
+    torch.testing.assert_close(found.mean, expected.mean(dim=1, keepdim=True), **EXACT)
+    torch.testing.assert_close(found.deviation, (expected.var(dim=1, keepdim=True) + 1e-5).sqrt(), **EXACT)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("source", "target"), [(2, 7), (40, 2), (5, 60)])
+def test_few_vertices_give_what_the_equations_give(form: str, source: int, target: int) -> None:
+    network, inputs = lively(form).double().eval(), pair(form, source=source, target=target, dtype=torch.float64)
+    torch.testing.assert_close(network(**inputs), LITERAL[form](network)(**inputs), rtol=1e-8, atol=1e-8)

@@ -1,0 +1,95 @@
+"""The machine's load, with GPUs by pynvml, by nvidia-smi, and without."""
+
+import logging
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from training.tracking.journal import read_journal
+from training.tracking.system_metrics import MachineLoad, gpu_reader, sampling
+
+
+def test_load_under_the_names_of_mlflow(tmp_path: Path) -> None:
+    load = MachineLoad(tmp_path)
+    found = load.read()
+    assert 0 <= found["system/cpu_utilization_percentage"] <= 100
+    assert 0 < found["system/system_memory_usage_megabytes"] < 1e8
+    assert 0 < found["system/disk_usage_percentage"] <= 100
+    assert all(key.startswith("system/") and isinstance(value, float) for key, value in found.items())
+
+
+def test_gpus_by_pynvml(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = types.SimpleNamespace(used=2e9, total=8e9)
+    nvml = types.SimpleNamespace(
+        nvmlInit=lambda: None,
+        nvmlDeviceGetCount=lambda: 2,
+        nvmlDeviceGetHandleByIndex=lambda index: index,
+        nvmlDeviceGetMemoryInfo=lambda handle: memory,
+        nvmlDeviceGetUtilizationRates=lambda handle: types.SimpleNamespace(gpu=50 + handle),
+        NVMLError=RuntimeError,
+    )
+    monkeypatch.setitem(sys.modules, "pynvml", nvml)
+    found = gpu_reader()()
+    assert found["gpu_1_utilization_percentage"] == 51 and found["gpu_0_memory_usage_megabytes"] == 2000
+    assert found["gpu_1_memory_usage_percentage"] == 25 and len(found) == 6
+
+
+def test_what_a_gpu_does_not_tell_is_left_out_and_the_rest_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    class NVMLError(Exception):
+        pass
+
+    def unsupported(handle: int) -> None:
+        raise NVMLError("Not Supported")
+
+    nvml = types.SimpleNamespace(
+        nvmlInit=lambda: None,
+        nvmlDeviceGetCount=lambda: 1,
+        nvmlDeviceGetHandleByIndex=lambda index: index,
+        nvmlDeviceGetMemoryInfo=lambda handle: types.SimpleNamespace(used=1e9, total=4e9),
+        nvmlDeviceGetUtilizationRates=unsupported,
+        NVMLError=NVMLError,
+    )
+    monkeypatch.setitem(sys.modules, "pynvml", nvml)
+    assert gpu_reader()() == {"gpu_0_memory_usage_megabytes": 1000, "gpu_0_memory_usage_percentage": 25}
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [("87, 1000, 4000\n12, 0, 4000", (87.0, 1048.576, 25.0)), ("[N/A], [N/A], [N/A]", None), ("", None)],
+)
+def test_gpus_by_nvidia_smi(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, expected: tuple[float, ...] | None
+) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f"#!/bin/sh\nprintf '{answer}'\n")
+    program.chmod(0o755)
+    monkeypatch.setitem(sys.modules, "pynvml", None)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    found = gpu_reader()()
+    if expected is None:
+        assert found == {}
+        return
+    names = ("utilization_percentage", "memory_usage_megabytes", "memory_usage_percentage")
+    assert tuple(found[f"gpu_0_{name}"] for name in names) == pytest.approx(expected) and len(found) == 6
+
+
+def test_no_gpu_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert gpu_reader()() == {}
+
+
+def test_sampling_goes_on_where_it_was_and_never_stops_the_work(tmp_path: Path, caplog) -> None:
+    import time
+
+    for _ in range(2):
+        with sampling(tmp_path / "system.jsonl", every=0.02):
+            time.sleep(0.15)
+    rows = read_journal(tmp_path / "system.jsonl")
+    assert [row["step"] for row in rows] == list(range(len(rows))) and len(rows) >= 4
+    (tmp_path / "file").write_text("")
+    with caplog.at_level(logging.WARNING), sampling(tmp_path / "file" / "system.jsonl", every=0.02):
+        pass
+    assert "no longer noted" in caplog.text

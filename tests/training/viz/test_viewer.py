@@ -1,0 +1,206 @@
+"""The page holds the meshes to the stated precision, loads nothing, and shows hostile names as plain text."""
+
+import base64
+import json
+import re
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datagen.common.arrays import Floats, Integers
+from training.viz.transfer_example import Comparison, ErrorScale, placed
+from training.viz.viewer import decode_positions, viewer_payload, write_viewer
+
+HOSTILE = "</script><img src=x onerror=alert(1)><!-- <script> ${title} &amp; \u2028 '\""
+
+
+@dataclass
+class Named:
+    vertices: Floats
+    faces: Integers
+    name: str = ""
+
+
+def examples(count: int = 2, name: str = "body", methods: tuple[str, ...] = ("DSFFNet",)) -> list[Comparison]:
+    """Transfers whose n-th output by the m-th method is off by n * m centimetres."""
+    random = np.random.default_rng(0)
+    faces = random.integers(0, 50, (80, 3))
+    up = np.array([0.0, 1, 0])
+    made = []
+    for index in range(1, count + 1):
+        truth = random.normal(size=(50, 3)) + 5
+        source, target, right = (Named(one, faces, name) for one in (*random.normal(size=(2, 50, 3)), truth))
+        outputs = {m: Named(truth + 0.01 * index * place * up, faces) for place, m in enumerate(methods, start=1)}
+        made.append(Comparison(f"{name} {index}", source, target, outputs, right, dict.fromkeys(methods, name)))
+    return made
+
+
+def script() -> str:
+    """The sources that the bundle is built from, three.js left out."""
+    names = ("viewer.js", "viewer.data.js", "viewer.meshes.js", "viewer.tiles.js")
+    return "\n".join((files("training.viz") / "assets" / name).read_text(encoding="utf-8") for name in names)
+
+
+class Elements(HTMLParser):
+    """Collects elements and the text of the data script, as a browser would meet them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[str, str] = {}
+        self.data = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        tag, attributes = self.elements[-1] if self.elements else ("", {})
+        self.texts[tag] = self.texts.get(tag, "") + data
+        if attributes.get("id") == "data":
+            self.data += data
+
+
+def parsed(path: Path) -> Elements:
+    elements = Elements()
+    elements.feed(path.read_text(encoding="utf-8"))
+    return elements
+
+
+def page_data(path: Path) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads(parsed(path).data.strip())
+    return data
+
+
+def embedded(example: dict[str, Any]) -> dict[str, Any]:
+    """The meshes of an example by the names that `placed` gives them."""
+    outputs = {f"output {name}": mesh for name, mesh in example["outputs"].items()}
+    return {role: example[role] for role in ("source", "target", "truth")} | outputs
+
+
+def test_positions_decode_to_within_half_a_step(tmp_path: Path) -> None:
+    originals = examples(methods=("DSFFNet", "NPT"))
+    data = page_data(write_viewer(originals, tmp_path / "viewer.html", title="t"))
+    for original, example in zip(originals, data["examples"], strict=True):
+        assert set(embedded(example)) == set(placed(original))
+        for name, mesh in placed(original).items():
+            half_step = np.ptp(mesh.vertices, axis=0) / 65535 / 2
+            off = np.abs(decode_positions(embedded(example)[name]) - mesh.vertices)
+            assert (off <= half_step * (1 + 1e-6) + 1e-12).all()
+
+
+def test_triangles_are_exact_and_kept_once(tmp_path: Path) -> None:
+    originals = examples()
+    data = page_data(write_viewer(originals, tmp_path / "viewer.html", title="t"))
+    assert len(data["faces"]) == 1
+    kept = data["faces"][data["examples"][1]["truth"]["faces"]]
+    assert kept["kind"] == "uint16"
+    indices = np.frombuffer(base64.b64decode(kept["indices"]), "<u2").reshape(-1, 3)
+    assert (indices == originals[0].source.faces).all()
+
+
+def test_many_vertices_take_wider_indices() -> None:
+    vertices = np.random.default_rng(0).normal(size=(65536, 3))
+    mesh = Named(vertices, np.array([[0, 1, 65535]]))
+    payload = viewer_payload([Comparison("big", mesh, mesh, {"m": mesh}, mesh)], error_scale=ErrorScale())
+    (kept,) = payload["faces"].values()
+    indices = np.frombuffer(base64.b64decode(kept["indices"]), "<u4")
+    assert kept["kind"] == "uint32" and indices.tolist() == [0, 1, 65535]
+
+
+def test_errors_are_in_the_unit_of_the_bar_and_share_its_limit(tmp_path: Path) -> None:
+    data = page_data(write_viewer(examples(), tmp_path / "viewer.html", title="t"))
+    errors = [example["errors"]["DSFFNet"] for example in data["examples"]]
+    values = [np.frombuffer(base64.b64decode(one["levels"]), "<u2") * one["step"] for one in errors]
+    assert values[0] == pytest.approx(1.0, rel=1e-4) and values[1] == pytest.approx(2.0, rel=1e-4)
+    assert data["error"]["unit"] == "cm" and data["error"]["limit"] == pytest.approx(2.0)
+    assert errors[1]["text"] == "mean 2, max 2 cm" and errors[1]["mean"] == pytest.approx(2.0)
+
+
+def test_several_methods_are_all_there_and_the_best_is_named(tmp_path: Path) -> None:
+    data = page_data(write_viewer(examples(methods=("b", "a", "NPT")), tmp_path / "viewer.html", title="t"))
+    assert [method["name"] for method in data["methods"]] == ["b", "a", "NPT"]
+    assert len({method["color"] for method in data["methods"]}) == 3
+    for example in data["examples"]:
+        assert list(example["outputs"]) == list(example["errors"]) == ["b", "a", "NPT"] and example["best"] == "b"
+
+
+def test_without_a_truth_there_are_meshes_and_no_errors(tmp_path: Path) -> None:
+    transfer = replace(examples(1)[0], truth=None, metrics={})
+    (example,) = page_data(write_viewer([transfer], tmp_path / "viewer.html", title="t"))["examples"]
+    assert example["truth"] is None and example["errors"] == {} and example["best"] is None
+    assert set(example["outputs"]) == {"DSFFNet"} and example["metrics"] == {"DSFFNet": ""}
+
+
+def test_each_example_is_first_seen_whole(tmp_path: Path) -> None:
+    small, large = examples(2)
+    larger = [Named(1000 * np.asarray(mesh.vertices), mesh.faces) for mesh in (large.source, large.target)]
+    lone = replace(large, source=larger[0], target=larger[1], outputs={}, truth=None)
+    views = [one["view"] for one in viewer_payload([small, lone], error_scale=ErrorScale())["examples"]]
+    assert views[1]["height"] > 100 * views[0]["height"]
+    assert all(np.linalg.norm(view["direction"]) == pytest.approx(1) for view in views)
+
+
+def test_the_page_loads_nothing(tmp_path: Path) -> None:
+    elements = parsed(write_viewer(examples(), tmp_path / "viewer.html", title="t")).elements
+    for _, attributes in elements:
+        assert not {"src", "href", "srcset", "action", "poster"} & set(attributes)
+    policy = next(a["content"] for _, a in elements if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy is not None and policy.startswith("default-src 'none'") and "http" not in policy
+    assert not re.search(r"url\(|@import", (files("training.viz") / "assets" / "viewer.css").read_text())
+
+
+def test_hostile_names_are_inert(tmp_path: Path) -> None:
+    page = parsed(write_viewer(examples(1, HOSTILE, (HOSTILE,)), tmp_path / "viewer.html", title=HOSTILE))
+    tags = [tag for tag, _ in page.elements]
+    assert tags.count("script") == 2 and "img" not in tags
+    assert HOSTILE in page.texts["title"] and HOSTILE in page.texts["h1"]
+    data = json.loads(page.data.strip())
+    assert data["examples"][0]["title"] == f"{HOSTILE} 1" and data["examples"][0]["metrics"] == {HOSTILE: HOSTILE}
+    assert data["examples"][0]["source"]["name"] == HOSTILE and data["methods"][0]["name"] == HOSTILE
+
+
+def test_the_bundle_can_stand_in_a_page_and_carries_its_licence(tmp_path: Path) -> None:
+    assets = files("training.viz") / "assets"
+    bundle = (assets / "viewer.bundle.js").read_text(encoding="utf-8")
+    assert len(bundle) < 800_000 and not re.search(r"</script|<!--", bundle, re.IGNORECASE)
+    licence = (assets / "THREE-LICENSE.txt").read_text(encoding="utf-8")
+    assert "MIT License" in licence and "three.js authors" in licence
+    assert licence in write_viewer(examples(), tmp_path / "viewer.html", title="t").read_text(encoding="utf-8")
+    assert "innerHTML" not in script()
+
+
+def test_pinned_versions_agree() -> None:
+    assets = files("training.viz") / "assets"
+    pinned = json.loads((assets / "package.json").read_text(encoding="utf-8"))["devDependencies"]
+    heading = (assets / "viewer.js").read_text(encoding="utf-8").splitlines()[0]
+    assert f"three {pinned['three']}" in heading and f"esbuild {pinned['esbuild']}" in heading
+    assert f'"{pinned["three"].split(".")[1]}"' in (assets / "viewer.bundle.js").read_text(encoding="utf-8")
+
+
+def test_the_bundle_is_built_from_the_script() -> None:
+    assets = files("training.viz") / "assets"
+    bundle = (assets / "viewer.bundle.js").read_text(encoding="utf-8")
+    words = set(re.findall(r'(?<!from )"([\w ]{4,}|[.#][\w-]+)"', script()))
+    assert len(words) > 30 and {word for word in words if f'"{word}"' not in bundle} == set()
+
+
+def test_page_and_script_agree_on_names() -> None:
+    assets = files("training.viz") / "assets"
+    page = (assets / "viewer.html").read_text(encoding="utf-8")
+    wanted = set(re.findall(r'find\("(\w+)"\)', script()))
+    assert wanted and wanted <= set(re.findall(r'id="(\w+)"', page))
+
+
+def test_nothing_to_show_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        write_viewer([], tmp_path / "viewer.html", title="t")
+    broken = examples(1)
+    broken[0].outputs["DSFFNet"].vertices[0] = np.inf
+    with pytest.raises(ValueError, match="1 of 50 vertices of the output DSFFNet are not finite"):
+        write_viewer(broken, tmp_path / "viewer.html", title="t")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,198 @@
+"""The ``dsffnet`` command and the workflow script as a person types them: output, one clear error, exit status."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.geometry import Mesh
+from datagen.store import open_dataset
+from tests.support.commands import ROOT, command, fails
+from tests.support.disk import grow, small_disk
+from tests.support.files import flip_bit, tree_hash
+from tests.support.recipes import tiny_training
+from training.engine.trainer import train
+from workflows.pipeline.console import alone_in
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A tiny dataset and a run trained on it."""
+    from datagen.generate import generate
+    from tests.support.recipes import tiny_dataset
+
+    folder = tmp_path_factory.mktemp("trained")
+    generate(tiny_dataset(), str(folder / "leg.zarr"))
+    train(tiny_training(), data=str(folder / "leg.zarr"), run=folder / "run")
+    return folder / "leg.zarr", folder / "run"
+
+
+def test_every_subcommand_has_help_with_an_example() -> None:
+    overview = command("--help").stdout
+    for name in (
+        "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
+        "transfer", "sync", "recipe",
+    ):  # fmt: skip
+        assert name in overview
+        assert f"dsffnet {name} " in command(name, "--help").stdout
+    assert "training.learning_rate = 0.001" in command("train", "--help").stdout
+
+
+def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
+    data = tmp_path / "leg.zarr"
+    made = command("generate", "--recipe", "smoke", "--local", "--out", data)
+    assert made.returncode == 0 and "status              complete" in made.stdout
+    picture = tmp_path / "sheet.png"
+    assert (
+        "176 of 96 vertices" in command("inspect", data, "--picture", picture).stdout
+        and picture.stat().st_size > 10_000
+    )
+    assert command("verify", data).stdout.endswith("is whole\n")
+    flip_bit(data / "identity/0002/vertices/c/1/0/0")
+    fails(command("verify", data), 1, "has 1 faults", f"dsffnet verify {data} --repair")
+    assert "identity/0002/vertices/c/1/0/0: its sha256" in command("verify", data).stdout
+    assert "is whole again" in command("verify", data, "--repair").stdout
+    assert command("verify", data).returncode == 0
+
+
+def test_transfer_between_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    data, run = trained
+    opened = open_dataset(str(data))
+    save_mesh(Mesh(opened.vertices(3, 7), opened.faces(3)), tmp_path / "pose.obj")
+    save_mesh(Mesh(opened.vertices(4, 0), opened.faces(4)), tmp_path / "person.ply")
+    paths = ("--source", tmp_path / "pose.obj", "--target", tmp_path / "person.ply", "--out", tmp_path / "posed.glb")
+    result = command("transfer", "--model", run, *paths)
+    assert result.returncode == 0, result.stderr
+    posed = load_mesh(tmp_path / "posed.glb")
+    assert np.array_equal(posed.faces, opened.faces(4)) and len(posed.vertices) == opened.vertices(4, 0).shape[0]
+
+
+def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    _, run = trained
+    (tmp_path / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    (tmp_path / "junk.glb").write_bytes(b"junk")
+    (tmp_path / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 4 2\n")
+
+    def transfer(source: str, model: Path = run, out: str = "out.obj") -> subprocess.CompletedProcess[str]:
+        target = tmp_path / "good.obj"
+        return command(
+            "transfer", "--model", model, "--source", tmp_path / source, "--target", target, "--out", tmp_path / out
+        )
+
+    fails(transfer("none.obj"), 1, "no mesh file at", "none.obj")
+    fails(transfer("nan.obj"), 1, "nan.obj", "1 vertices are not finite")
+    fails(transfer("points.obj"), 1, "points.obj holds 3 vertices and no faces")
+    fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as GLB")
+    fails(transfer("good.obj", model=tmp_path / "norun"), 1, "norun has no usable checkpoint")
+    fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = sys.modules['mlflow'] = None\n")
+    recipe = ("--recipe", "smoke", "--set", "training.launcher=inline", "training.ranks=1", "training.steps=2")
+    place = ("--data", trained[0], "--out", tmp_path / "run")
+    done = command("train", *recipe, *place, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    assert done.returncode == 0 and "trained: " in done.stdout, done.stderr
+    assert done.stderr.count("MLflow is not installed here") == 1 and "Traceback" not in done.stderr
+
+
+def test_a_checkpoint_is_chosen(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    opened = open_dataset(str(trained[0]))
+    save_mesh(Mesh(opened.vertices(3, 7), opened.faces(3)), tmp_path / "a.obj")
+    meshes = ("--source", tmp_path / "a.obj", "--target", tmp_path / "a.obj", "--out", tmp_path / "b.obj")
+    done = command("transfer", "--model", trained[1], "--checkpoint", "4", *meshes)
+    assert done.returncode == 0, done.stderr
+    fails(command("transfer", "--model", trained[1], "--checkpoint", "5", *meshes), 1, "step-00000005")
+    assert command("transfer", "--model", trained[1], "--checkpoint", "newest", *meshes).returncode == 2
+
+
+def test_bad_recipes_and_usage_exit_2(tmp_path: Path) -> None:
+    out = tmp_path / "x.zarr"
+    fails(command("generate", "--recipe", "quickstrat", "--out", out), 2, "did you mean 'quickstart'")
+    fails(
+        command("--recipe", "smoke", "--out", tmp_path / "w", "--set", "training.stepz=3", script="full.py"), 2,
+        "unknown key 'training.stepz', did you mean 'training.steps'?",
+    )  # fmt: skip
+    assert command("generate").returncode == 2 and not out.exists() and not (tmp_path / "w").exists()
+
+
+def test_a_full_disk_is_one_error_and_going_on_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    arguments = ("generate", "--recipe", "smoke", "--local", "--set", "data.poses.seen=100")
+    undisturbed = tmp_path / "undisturbed.zarr"
+    assert command(*arguments, "--out", undisturbed).returncode == 0
+    with small_disk(tmp_path / "disk", kibibytes=600) as disk:
+        data = disk / "leg.zarr"
+        fails(
+            command(*arguments, "--out", data, "--yes"), 1, "No space left on device", "What was complete is untouched"
+        )
+        assert "building" in command("inspect", data).stdout
+        grow(disk, kibibytes=16_000)
+        assert command(*arguments, "--out", data).returncode == 0
+        assert tree_hash(data) == tree_hash(undisturbed)
+
+
+def test_missing_and_unfinished_datasets(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    fails(command("inspect", tmp_path / "no.zarr"), 1, "no dataset at", "dsffnet generate")
+    fails(command("train", "--data", tmp_path / "no.zarr", "--out", tmp_path / "run"), 1, "no dataset at")
+    fails(command("sync", tmp_path), 1, "holds no record of a run")
+
+
+def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
+    result = command("--recipe", "smoke", "--out", "runs/x", script="full.py", RAY_ADDRESS="127.0.0.1:1")
+    fails(result, 2, "--out 'runs/x' is a relative path", "throw-away copy", "--out /data/runs/x")
+    fails(command("--recipe", "smoke", script="full.py", RAY_ADDRESS="127.0.0.1:1"), 2, "relative path")
+
+
+def test_two_workflows_in_one_folder(tmp_path: Path) -> None:
+    with alone_in(tmp_path / "w"):
+        fails(
+            command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another command is at work in"
+        )
+
+
+def test_fresh_leaves_other_peoples_files_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    fails(command("--recipe", "smoke", "--out", tmp_path, "--fresh", script="full.py"), 2, "leaves it alone")
+    assert (tmp_path / "thesis.txt").exists()
+
+
+def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    from training.tracking.record import begin_record
+
+    begin_record(tmp_path / "workflow", name="w", kind="workflow", parent=None, parameters={})
+    (tmp_path / "workflow" / "dataset.txt").write_text("precious")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("precious")
+    for place in ("workflow", "other"):
+        result = command("train", "--recipe", "smoke", "--data", trained[0], "--out", tmp_path / place, "--fresh")
+        fails(result, 2, "is not the folder of a training, so --fresh leaves it alone")
+    assert (tmp_path / "workflow" / "dataset.txt").exists() and (tmp_path / "other" / "thesis.txt").exists()
+
+
+def test_more_bad_input_is_one_line(tmp_path: Path, trained: tuple[Path, Path]) -> None:
+    data, _ = trained
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "empty.yaml").write_text("")
+    fails(command("--recipe", "smoke", "--out", tmp_path / "file", script="full.py"), 1, "file")
+    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file" / "x.zarr"), 1, "file")
+    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file", "--fresh"), 1, "is a file")
+    fails(command("recipe", "--recipe", tmp_path / "empty.yaml"), 2, "or is empty")
+    fails(command("recipe", "--set", "training.network.encoder_widths=[0,8,8]"), 2, "encoder_widths.0", "given: 0")
+    fails(command("recipe", "--set", "training.learning_rate=.inf"), 2, "training.learning_rate")
+    fails(command("recipe", "--set", "training.steps=${nothing}"), 2, "interpolation is not supported")
+    fails(command("train", "--data", data, "--out", "s3://bucket/run"), 2, "is a URL")
+    fails(command("evaluate", tmp_path / "norun", "--data", data), 1, "norun has no usable checkpoint")
+    assert not (tmp_path / "norun").exists()
+    silent = command("generate", "--recipe", "smoke", "--out", tmp_path / "y.zarr", RAY_ADDRESS="127.0.0.1:1")
+    fails(silent, 1, "no Ray head answers at RAY_ADDRESS 127.0.0.1:1")
+
+
+def test_printed_recipe_can_be_used_as_a_file(tmp_path: Path) -> None:
+    printed = command("recipe", "--recipe", "smoke", "--set", "training.seed=4").stdout
+    (tmp_path / "mine.yaml").write_text(printed)
+    assert command("recipe", "--recipe", tmp_path / "mine.yaml").stdout == printed

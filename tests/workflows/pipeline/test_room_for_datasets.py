@@ -1,0 +1,175 @@
+"""Commands say what a dataset takes before they make it, and refuse in one line what there is no room for."""
+
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from datagen import sizes
+from datagen.common.errors import RecipeError
+from tests.support.recipes import tiny_dataset
+from workflows import full
+from workflows.cli import main as cli
+from workflows.pipeline import data_size
+from workflows.pipeline.console import guarded
+from workflows.pipeline.data_size import announce_size
+from workflows.sweep.plan import plan_sweep
+
+Printed = pytest.CaptureFixture[str]
+SMOKE = ["--recipe", "smoke", "--set", "data.poses.seen=4", "data.poses.unseen=2"]
+
+
+def refused(run: Callable[[], object], status: int, says: str, printed: Printed) -> None:
+    """It ends with that status and one line on standard error."""
+    with pytest.raises(SystemExit) as ended:
+        run()
+    error = printed.readouterr().err
+    assert ended.value.code == status and error.startswith("error: ") and error.count("\n") == 1, error
+    assert says in error
+
+
+def generate(out: Path, *options: str) -> None:
+    cli.main(["generate", *SMOKE, "--local", "--out", str(out), *options])
+
+
+def test_the_size_is_the_first_thing_said_and_only_where_there_is_something_to_make(
+    tmp_path: Path, capsys: Printed
+) -> None:
+    generate(tmp_path / "x.zarr")
+    assert "] generate: 34 meshes of 96 vertices, " in capsys.readouterr().out.splitlines()[0]
+    generate(tmp_path / "x.zarr")
+    assert "generate:" not in capsys.readouterr().out
+    cli.main(["append", str(tmp_path / "x.zarr"), "--unseen", "3", "--local"])
+    assert "] generate: 37 meshes of 96 vertices, " in capsys.readouterr().out.splitlines()[0]
+
+
+def test_a_disk_that_is_too_small_is_said_before_anything_is_made_and_yes_goes_on(
+    tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sizes, "free_disk", lambda folder: 1_000)
+    refused(lambda: generate(tmp_path / "x.zarr"), 1, "its disk has 1.0 kB left", capsys)
+    assert not list(tmp_path.iterdir())
+    generate(tmp_path / "x.zarr", "--yes")
+    capsys.readouterr()
+    generate(tmp_path / "x.zarr")  # there is nothing to make
+    append = ["append", str(tmp_path / "x.zarr"), "--training", "60", "--local"]
+    refused(lambda: cli.main(append), 1, "its disk has 1.0 kB left", capsys)
+
+
+def test_object_stores_have_no_end(capsys: Printed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sizes, "free_disk", lambda folder: 0)
+    announce_size(tiny_dataset(), "s3://bucket/x.zarr", anew=True, yes=False)
+    assert "38 meshes of 32 vertices" in capsys.readouterr().out
+
+
+HUGE = ["--recipe", "smoke", "--set", "data.identities.training=1000000000000"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["generate", *HUGE],
+        ["sweep", *HUGE, "--vary", "training.seed=1,2"],
+        ["compare", "--recipe", "small", *HUGE[2:]],
+        ["ablation", *HUGE[2:]],
+        ["full", *HUGE],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_million_million_identities_are_refused_by_every_command(
+    command: list[str], tmp_path: Path, capsys: Printed
+) -> None:
+    name, *words = [*command, "--out", str(tmp_path / "out"), "--fresh"]
+    run = (lambda: guarded(lambda: full.main(words))) if name == "full" else (lambda: cli.main([name, *words]))
+    refused(run, 2, "of memory, but", capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_appending_a_million_million_is_refused(spoilable: Path, capsys: Printed) -> None:
+    refused(lambda: cli.main(["append", str(spoilable), "--seen", str(10**12), "--local"]), 2, "Lower data.", capsys)
+    refused(lambda: cli.main(["append", str(spoilable), "--seen", "9" * 400, "--local"]), 2, "has 63", capsys)
+
+
+@pytest.mark.parametrize(
+    ("meshes", "address", "local", "workers"),
+    [(5_000, "", False, 64), (5_000, "", True, 1), (5_000, "head:6379", False, 1), (4_999, "", False, 1)],
+)
+def test_memory_is_asked_for_the_workers_that_this_machine_has_at_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, meshes: int, address: str, local: bool, workers: int
+) -> None:
+    """One where little is made, which needs no Ray; one of a cluster, whose other machines have memory of their own."""
+    asked: list[int] = []
+
+    def size(recipe: object, workers: int) -> SimpleNamespace:
+        asked.append(workers)
+        return SimpleNamespace(meshes=meshes)
+
+    monkeypatch.setattr(data_size, "size_of", size)
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True, local=local)
+    assert max(asked) == workers
+
+
+def test_a_grid_of_a_hundred_million_trials_is_refused() -> None:
+    vary = [f"training.{key}={','.join(map(str, range(1, 101)))}" for key in ("seed", "batch", "steps", "log_every")]
+    with pytest.raises(RecipeError, match="the varied values make 100,000,000 trials, more than 10,000"):
+        plan_sweep(recipe="smoke", shared=[], vary=vary)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        np._core._exceptions._ArrayMemoryError((1 << 50,), np.dtype("u1")),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4 bytes.\nAt alloc_cpu.cpp"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_memory_that_runs_out_anywhere_is_one_line(
+    error: Exception, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make_shard(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("datagen.generate.make_shard", make_shard)
+    with pytest.raises(SystemExit) as ended:
+        generate(tmp_path / "x.zarr")
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert ended.value.code == 1 and "error: memory ran out (" in last and "lower counts, vertices" in last
+    monkeypatch.undo()
+    generate(tmp_path / "x.zarr")  # nothing was lost
+
+
+def test_what_a_terminal_should_not_be_sent_is_escaped(capsys: Printed) -> None:
+    def main() -> None:
+        raise RecipeError("no recipe '\x1b]0;owned\x07\n2'")
+
+    refused(lambda: guarded(main), 2, r"'\x1b]0;owned\x07\n2'", capsys)
+
+
+def test_text_that_the_shell_cannot_show_is_written_with_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="ascii", errors="strict"))
+    guarded(lambda: print("Grüße"))
+    sys.stdout.flush()
+    assert raw.getvalue() == b"Gr\\xfc\\xdfe\n"
+
+
+def test_a_name_that_the_shells_encoding_lacks_is_refused_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, capsys: Printed
+) -> None:
+    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "ascii")
+    monkeypatch.setattr(sys, "argv", ["dsffnet", "inspect", "d\udcc3\udca4ta.zarr"])
+    refused(cli.main, 2, "cannot be read in this shell's encoding, ascii. Set PYTHONUTF8=1 and run again", capsys)
+
+
+def test_a_name_that_is_no_text_at_all_is_one_line(capsys: Printed) -> None:
+    def no_text() -> None:
+        "caf\udce9".encode()
+
+    refused(lambda: guarded(no_text), 1, r"'caf\udce9' is not UTF-8 text", capsys)

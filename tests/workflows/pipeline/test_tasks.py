@@ -1,0 +1,176 @@
+"""Little work is done in this process, much on Ray; what decides, what is said, and what happens where Ray fails."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from datagen.common.errors import ClusterError
+from datagen.generate import append, generate, inline
+from datagen.store import open_dataset
+from tests.support.recipes import tiny_dataset, tiny_training
+from training.recipes.training import EvaluationRecipe
+from workflows.cli.main import main
+from workflows.pipeline import tasks
+from workflows.pipeline.own_ray import own_ray
+from workflows.pipeline.tasks import TaskRunner
+
+
+@pytest.fixture(autouse=True)
+def on_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RAY_ADDRESS", "RAY_JOB_CONFIG_JSON_ENV_VAR"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def ray_starts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Starts and ends of a Ray that is none; its tasks run here."""
+    seen: list[str] = []
+
+    @contextmanager
+    def cluster() -> Iterator[None]:
+        seen.append("started")
+        yield
+        seen.append("ended")
+
+    monkeypatch.setattr(tasks, "ray_cluster", cluster)
+    monkeypatch.setattr(tasks, "ray_runner", lambda task, arguments: seen.append("tasks") or inline(task, arguments))
+    return seen
+
+
+def test_a_small_dataset_is_made_without_ray(
+    tmp_path: Any, ray_starts: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with TaskRunner() as runner:
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
+    assert not ray_starts
+    assert capsys.readouterr().err == "generate: 38 meshes, in this process (Ray from 5,000)\n"
+
+
+def test_a_large_one_is_made_on_ray_which_ends_with_the_block(
+    tmp_path: Any, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 38)
+    with TaskRunner() as runner:
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
+        assert ray_starts == ["started", "tasks"]
+    assert ray_starts[-1] == "ended"
+    assert capsys.readouterr().err == "generate: 38 meshes, on Ray (Ray from 38)\n"
+    again = TaskRunner(local=True)
+    generate(tiny_dataset(), str(tmp_path / "y.zarr"), run=again.make_shards)
+    assert len(ray_starts) == 3 and "in this process (--local)" in capsys.readouterr().err
+
+
+def test_only_what_is_appended_counts(
+    spoilable: Any, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 38)  # as many as are there
+    with TaskRunner() as runner:
+        append(str(spoilable), unseen=6, run=runner.make_shards)
+    assert not ray_starts and "generate: 4 meshes, in this process" in capsys.readouterr().err
+
+
+def test_a_complete_dataset_starts_nothing(dataset: str, ray_starts: list[str]) -> None:
+    with TaskRunner() as runner:
+        generate(tiny_dataset(), dataset, run=runner.make_shards)
+    assert not ray_starts
+
+
+def test_on_a_cluster_everything_goes_there(
+    tmp_path: Any, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    with TaskRunner() as runner:
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
+    assert ray_starts.count("tasks") == 2  # the preparation, and the shards
+
+
+def test_few_triples_are_measured_here(
+    dataset: str, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runner, opened, recipe = TaskRunner(), open_dataset(dataset), EvaluationRecipe(triples=3)
+    assert list(runner.measure(opened, recipe)(lambda number: number, [(1,), (2,)])) == [1, 2]
+    assert capsys.readouterr().err == "evaluate: 192 vertices, in this process (Ray from 100,000)\n"  # 2 x 3 x 32
+    monkeypatch.setattr(tasks, "RAY_FROM_VERTICES", 192)
+    list(runner.measure(opened, recipe)(lambda number: number, [(1,)]))
+    assert ray_starts == ["started", "tasks"]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "cluster", "local", "launcher", "starts"),
+    [
+        ({"launcher": "auto"}, False, False, "inline", False),
+        ({"launcher": "auto"}, True, False, "ray", True),
+        ({"launcher": "auto", "ranks": 2}, False, False, "ray", True),
+        ({"launcher": "ray"}, False, False, "ray", True),
+        ({"launcher": "inline"}, True, False, "inline", False),
+        ({"launcher": "ray", "ranks": 2, "fewest_ranks": 1}, False, True, "inline", False),
+    ],
+)
+def test_who_trains(
+    recipe: dict[str, Any],
+    cluster: bool,
+    local: bool,
+    launcher: str,
+    starts: bool,
+    ray_starts: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if cluster:
+        monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    chosen = TaskRunner(local=local).training(tiny_training(**recipe))
+    assert chosen.launcher == launcher and bool(ray_starts) == starts
+    assert (chosen.ranks, chosen.fewest_ranks) == (1, None) if local else chosen.ranks == recipe.get("ranks", 1)
+
+
+def test_ray_that_does_not_start_at_first_is_given_more_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ray waits 30 s for its node, by asking ``get_node`` until it answers; a busy machine may need longer."""
+    import ray
+    from ray._private import services
+
+    answers = iter([RuntimeError("not yet"), RuntimeError("not yet"), {"labels": {}}])
+    tries: list[Any] = []
+
+    def get_node(address: str, node: str) -> Any:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def init(**options: Any) -> None:
+        tries.append(options)
+        if len(tries) == 1:
+            raise Exception("The current node timed out during startup.\nMore")
+        assert services.get_node("127.0.0.1:1", "node") == {"labels": {}}
+
+    monkeypatch.setattr(services, "get_node", get_node)
+    monkeypatch.setattr(ray, "init", init)
+    with own_ray():
+        assert services.get_node is get_node
+    assert len(tries) == 2 and tries[0]["address"] == "local"
+    said = capsys.readouterr().err
+    assert said == "Ray did not start (The current node timed out during startup.); once more, with more time\n"
+
+
+def test_ray_that_does_not_start_at_all_is_one_line_with_what_else_to_do(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import ray
+
+    def init(**options: Any) -> None:
+        raise TimeoutError("Timed out after 30 seconds")
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ClusterError, match=r"tried twice \(Timed out after 30 seconds\)") as raised, own_ray():
+        raise AssertionError("the block must not run")
+    assert "--local" in str(raised.value) and "training.launcher=inline" in str(raised.value)
+    assert "\n" not in str(raised.value)
+    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 1)
+    with pytest.raises(SystemExit) as ended:
+        main(["generate", "--recipe", "smoke", "--out", str(tmp_path / "x.zarr")])
+    assert ended.value.code == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("error: Ray did not start") and not any("Traceback" in line for line in lines)

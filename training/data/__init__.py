@@ -1,0 +1,1 @@
+"""Triples in their order, batches, meshes kept in memory or streamed."""

@@ -1,0 +1,181 @@
+"""One batch of triples as the networks and losses take it, of one vertex count or of many."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datagen.common.errors import DatasetError
+from datagen.store import Dataset
+from training.data.triples import Triples
+from training.data.vertex_layout import normalised
+from training.objectives.edge_incidence import INCIDENCES, incidence_of, join_incidences
+from training.objectives.losses import loss_edges
+
+Counts = tuple[int, ...]
+EdgeSum = Literal["edges", "faces"]
+
+
+@dataclass(frozen=True)
+class PackedEdges:
+    """Edges of the targets of a batch whose meshes have different topologies.
+
+    Attributes
+    ----------
+    pairs
+        ``[e, 2]`` int64, rows of the padded vertices as one array ``[b * n_target, 3]``: mesh * n_target + vertex.
+    meshes
+        ``[e]`` int64, the mesh of the batch that each edge is of; ascending.
+    """
+
+    pairs: Tensor
+    meshes: Tensor
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "PackedEdges":
+        """The same on another device."""
+        pairs, meshes = (its.to(device, non_blocking=non_blocking) for its in (self.pairs, self.meshes))
+        return PackedEdges(pairs, meshes)
+
+    def part(self, start: int, stop: int, *, rows: int) -> "PackedEdges":
+        """Those of the meshes from ``start`` to ``stop`` of a batch padded to ``rows`` vertices."""
+        inside = (self.meshes >= start) & (self.meshes < stop)
+        return PackedEdges(self.pairs[inside] - start * rows, self.meshes[inside] - start)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The three meshes of each triple, float32 in the normalised box of each mesh, and the edges of the targets.
+
+    Attributes
+    ----------
+    source, target, truth
+        ``[b, n, 3]``; n_source may differ from n_target. Rows behind a mesh's count are zero.
+    edges
+        ``[e, 2]`` int64 indices of vertices where all targets have one topology; else `PackedEdges`.
+    source_counts, target_counts
+        Vertices of each mesh, for :class:`training.networks.padded_batches.MixedCounts`; None: all n. The truth has the
+        target's.
+    """
+
+    source: Tensor
+    target: Tensor
+    truth: Tensor
+    edges: Tensor | PackedEdges
+    source_counts: Counts | None = None
+    target_counts: Counts | None = None
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
+        """The same on another device."""
+        meshes = (self.source, self.target, self.truth)
+        source, target, truth = (its.to(device, non_blocking=non_blocking) for its in meshes)
+        edges = self.edges.to(device, non_blocking=non_blocking)
+        return Batch(source, target, truth, edges, self.source_counts, self.target_counts)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def in_dtype(self, dtype: torch.dtype) -> "Batch":
+        """The same with vertices in another floating type."""
+        meshes = {name: getattr(self, name).to(dtype) for name in ("source", "target", "truth")}
+        return replace(self, **meshes)
+
+    def part(self, start: int, stop: int) -> "Batch":
+        """Its triples from ``start`` to ``stop``."""
+        edges = self.edges
+        if isinstance(edges, PackedEdges):
+            edges = edges.part(start, stop, rows=self.target.shape[1])
+        at = slice(start, stop)
+        source_counts, target_counts = (its and its[at] for its in (self.source_counts, self.target_counts))
+        return Batch(self.source[at], self.target[at], self.truth[at], edges, source_counts, target_counts)
+
+
+class EdgeTable:
+    """Edges of some identities, each topology's once, on a device.
+
+    Parameters
+    ----------
+    of
+        See :func:`training.objectives.losses.loss_edges`.
+    """
+
+    def __init__(
+        self, dataset: Dataset, identities: Sequence[int], *, device: torch.device | str, of: EdgeSum = "edges"
+    ) -> None:
+        self._topology: dict[int, int] = {}
+        self._edges: list[Tensor] = []
+        self._counts: list[int] = []
+        known: dict[bytes, int] = {}
+        for identity in identities:
+            faces = dataset.faces(identity)
+            number = known.setdefault(faces.tobytes(), len(known))
+            if number == len(self._edges):
+                self._edges.append(torch.from_numpy(loss_edges(faces, of)).to(device))
+                self._counts.append(dataset.vertex_count(identity))
+            self._topology[int(identity)] = number
+
+    def of(self, identities: NDArray[np.integer], *, rows: int) -> Tensor | PackedEdges:
+        """Edges of a batch of targets, padded to ``rows`` vertices each."""
+        numbers = [self._topology[int(identity)] for identity in identities]
+        if len(set(numbers)) == 1:
+            return self._edges[numbers[0]]
+        return _packed([self._edges[number] for number in numbers], [self._counts[number] for number in numbers], rows)
+
+
+def _packed(edges: Sequence[Tensor], counts: Sequence[int], rows: int) -> PackedEdges:
+    """Edges [e, 2] of meshes of so many vertices, each padded to ``rows``; nothing waits for a GPU.
+
+    How they touch is put together from what is known of each topology: sorting a batch's edges anew would take longer.
+    """
+    pairs = torch.cat([its + rows * mesh for mesh, its in enumerate(edges)])
+    meshes = torch.cat([torch.full_like(its[:, 0], mesh) for mesh, its in enumerate(edges)])
+    parts = [incidence_of(its, count) for its, count in zip(edges, counts, strict=True)]
+    INCIDENCES[pairs] = join_incidences(pairs, parts, rows)
+    return PackedEdges(pairs, meshes)
+
+
+def counts_of(counts: NDArray[np.integer]) -> Counts | None:
+    """Counts of a batch's meshes, None where they are equal."""
+    return None if (counts == counts[0]).all() else tuple(int(count) for count in counts)
+
+
+def read_batch(dataset: Dataset, triples: Triples, *, padded: bool = False) -> Batch:
+    """The normalised meshes of rows (source identity, source pose, target identity, target pose), and only those.
+
+    For a few triples of a large dataset; :func:`training.data.vertex_bank.open_bank` is for many.
+
+    Parameters
+    ----------
+    padded
+        Pad meshes of different counts; the caller then minds ``source_counts`` and ``target_counts``.
+
+    Raises
+    ------
+    DatasetError
+        A shard is missing or damaged, or vertex counts differ and were not to be padded.
+    """
+    source_identity, source_pose, target_identity, target_pose = triples.T
+    source, source_counts = _read(dataset, source_identity, source_pose, padded=padded)
+    target, target_counts = _read(dataset, target_identity, target_pose, padded=padded)
+    truth, _ = _read(dataset, target_identity, source_pose, padded=padded)
+    table = EdgeTable(dataset, np.unique(target_identity).tolist(), device="cpu")
+    edges = table.of(target_identity, rows=target.shape[1])
+    return Batch(source, target, truth, edges, source_counts, target_counts)
+
+
+def _read(
+    dataset: Dataset, identities: NDArray[np.integer], poses: NDArray[np.integer], *, padded: bool
+) -> tuple[Tensor, Counts | None]:
+    counts = np.array([dataset.vertex_count(int(identity)) for identity in identities])
+    if counts_of(counts) and not padded:
+        raise DatasetError(
+            f"{dataset.url} mixes vertex counts ({counts.min()} to {counts.max()}), which this step cannot take. "
+            "Use a dataset of one body"
+        )
+    meshes = np.zeros((len(counts), counts.max(), 3), np.float32)
+    for mesh, identity, pose, count in zip(meshes, identities, poses, counts, strict=True):
+        mesh[:count] = normalised(dataset.vertices(int(identity), [int(pose)]))[0]
+    return torch.from_numpy(meshes), counts_of(counts)

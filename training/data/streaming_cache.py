@@ -1,0 +1,99 @@
+"""Meshes of a dataset that fits nowhere: read when they are needed, the last used ones kept, memory bounded.
+
+A mesh, not a shard, is what is kept. Triples are random over the whole grid, so a batch touches nearly as many shards
+as meshes; were shards kept, one mesh in a hundred of them would be of use soon. Meshes of many steps are asked for
+together, and a shard is decoded whole where that costs less than asking the store for each of its wanted meshes.
+"""
+
+import threading
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datagen.common.errors import RecipeError
+from datagen.common.resources import bytes_text
+from training.data.vertex_layout import Floats, Layout
+
+_READERS_HERE, _READERS_AFAR = 2, 16  # a remote store answers in some 30 ms, whatever is asked
+_REQUEST_BYTES_HERE, _REQUEST_BYTES_AFAR = 2**18, 2**21  # that are read and decoded in the time of one more request
+_FEWEST_SLOTS = 64
+
+
+class StreamedMeshes:
+    """Normalised meshes of a layout in a given number of bytes: ``slots`` of ``rows`` vertices, the oldest used again.
+
+    Parameters
+    ----------
+    memory
+        Bytes for meshes.
+    """
+
+    def __init__(self, layout: Layout, *, memory: int) -> None:
+        self._layout, self.rows = layout, int(layout.counts.max())
+        self.slots = min(max(_FEWEST_SLOTS, memory // (12 * self.rows)), len(layout.counts))
+        self._held = torch.from_numpy(np.zeros((self.slots, self.rows, 3), np.float32))  # takes memory as it fills
+        self._slot: OrderedDict[int, int] = OrderedDict()
+        self._guard = threading.RLock()
+        afar = "://" in layout.dataset.url.removeprefix("file://")
+        self._request_bytes = _REQUEST_BYTES_AFAR if afar else _REQUEST_BYTES_HERE
+        readers = _READERS_AFAR if afar else _READERS_HERE
+        self._readers = ThreadPoolExecutor(readers, thread_name_prefix="stream")
+
+    def close(self) -> None:
+        """End the reading threads."""
+        self._readers.shutdown(wait=True, cancel_futures=True)
+
+    def fetch(self, meshes: NDArray[np.int64]) -> None:
+        """Read those meshes that are not held, together, and hold them all.
+
+        Raises
+        ------
+        DatasetError
+            A shard is missing or damaged.
+        RecipeError
+            They are more than there is memory for.
+        """
+        wanted = np.unique(meshes)
+        if len(wanted) > self.slots:
+            raise RecipeError(
+                f"a batch needs {len(wanted)} meshes at once, but streaming has memory for {self.slots} "
+                f"({bytes_text(12 * self.rows * self.slots)}). Lower training.batch or use --set training.cache=mapped"
+            )
+        with self._guard:
+            missing = np.array([mesh for mesh in wanted.tolist() if mesh not in self._slot], np.int64)
+            for mesh in np.setdiff1d(wanted, missing).tolist():
+                self._slot.move_to_end(mesh)
+            places = np.flatnonzero(np.diff(self._layout.shards[missing])) + 1
+            by_shard = [its for its in np.split(missing, places) if len(its)]
+            for some, read in zip(by_shard, self._readers.map(self._read, by_shard), strict=True):
+                self._hold(some, read)
+
+    def _read(self, meshes: NDArray[np.int64]) -> Floats:
+        """Vertices [mesh, vertex, 3] of some meshes of one shard, which is decoded whole if that is quicker."""
+        first, end = np.searchsorted(self._layout.shards, self._layout.shards[meshes[0]] + np.arange(2))
+        whole = 12 * int(self._layout.counts[first]) * (end - first)
+        among = np.arange(first, end) if whole < len(meshes) * self._request_bytes else None
+        return self._layout.read(meshes, among=among)
+
+    def _hold(self, meshes: NDArray[np.int64], read: Floats) -> None:
+        for mesh, vertices in zip(meshes.tolist(), read, strict=True):
+            free = len(self._slot) < self.slots
+            slot = len(self._slot) if free else self._slot.popitem(last=False)[1]
+            self._held[slot, : len(vertices)] = torch.from_numpy(vertices)
+            self._held[slot, len(vertices) :] = 0
+            self._slot[mesh] = slot
+
+    def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
+        """Vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to the largest of the group."""
+        return [self._gathered(group) for group in groups]
+
+    def _gathered(self, meshes: NDArray[np.int64]) -> Tensor:
+        with self._guard:
+            self.fetch(meshes)
+            slots = torch.tensor([self._slot[int(mesh)] for mesh in meshes])
+            rows = int(self._layout.counts[meshes].max())
+            return self._held[:, :rows].index_select(0, slots)

@@ -1,0 +1,160 @@
+"""Where the meshes of some identities lie in one array of vertices, and how they come there from a dataset."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.grid import HOLE, SPLITS, Split
+from datagen.mesh.geometry import Box, bounds
+from datagen.store import Dataset
+
+Numbers = NDArray[np.integer]
+Floats = NDArray[np.float32]
+
+_CHUNK_BYTES = 2**25  # decoded at a time by one thread; part of the format of mapped files, see there
+_MOST_THREADS = 8
+
+
+def normalised(meshes: Floats) -> Floats:
+    """Vertices [mesh, vertex, 3] float32 in any unit, each mesh moved and scaled to its own bounding box, in [-1, 1].
+
+    The box's centre goes to the origin, half its longest edge to one (DSFFNet, section 4.1, after NPT).
+    """
+    low, high = bounds(meshes)
+    return Box((low + high) / 2, (high - low).max(axis=-1) / 2).normalise(meshes).astype(np.float32, copy=False)
+
+
+class Layout:
+    """All meshes of some identities, one after another in an array [vertex, 3], identity by identity, pose by pose.
+
+    Attributes
+    ----------
+    counts
+        Vertices of each mesh [mesh] int64.
+    starts
+        Place of each mesh' first vertex [mesh] int64.
+    shards
+        A number for the shard that each mesh is in [mesh] int64, ascending.
+    """
+
+    def __init__(self, dataset: Dataset, identities: Sequence[int]) -> None:
+        self.dataset, self.identities = dataset, tuple(int(identity) for identity in identities)
+        grid = dataset.grid
+        meshes = [len(grid.poses_of(identity)) for identity in self.identities]
+        self.counts = np.repeat([dataset.vertex_count(identity) for identity in self.identities], meshes)
+        self.starts = np.cumsum(self.counts) - self.counts
+        self._owner = np.repeat(np.arange(len(meshes)), meshes)
+        self._firsts = np.cumsum(meshes) - meshes
+        self._index = np.full(grid.identity_count, -1)
+        self._index[list(self.identities)] = np.arange(len(self.identities))
+        self._split = np.array([SPLITS.index(grid.split(identity)) for identity in self.identities])
+        self._place = np.stack([self._places_in(split) for split in SPLITS])
+        within = [self._shards_in(grid.split(identity)) for identity in self.identities]
+        self.shards = self._owner * (1 + max(its[-1] for its in within)) + np.concatenate(within)
+
+    def _rows_in(self, split: Split) -> NDArray[np.int64]:
+        """The pose of each row of a split's identities, as :meth:`datagen.grid.Grid.rows_of` has it."""
+        members = self.dataset.grid.identities(split)
+        return self.dataset.grid.rows_of(members[0]) if members else np.empty(0, np.int64)
+
+    def _places_in(self, split: Split) -> NDArray[np.int64]:
+        """Place of every pose among those of a split's identities; -1 where they were not made in it."""
+        places, rows = np.full(self.dataset.grid.pose_count, -1), self._rows_in(split)
+        poses = rows[rows != HOLE]
+        places[poses] = np.arange(len(poses))
+        return places
+
+    def _shards_in(self, split: Split) -> NDArray[np.int64]:
+        """The shard of each mesh of an identity of a split."""
+        return np.flatnonzero(self._rows_in(split) != HOLE) // self.dataset.grid.rows_per_shard(split)
+
+    @property
+    def vertices(self) -> int:
+        """Vertices of all meshes together."""
+        return int(self.counts.sum())
+
+    @property
+    def bytes(self) -> int:
+        """Size of the array."""
+        return 12 * self.vertices
+
+    @property
+    def count(self) -> int | None:
+        """Vertices of every mesh; None where they differ."""
+        return int(self.counts[0]) if (self.counts == self.counts[0]).all() else None
+
+    def meshes(self, identities: Numbers, poses: Numbers) -> NDArray[np.int64]:
+        """Numbers of the meshes (identity, pose).
+
+        Raises
+        ------
+        KeyError
+            An identity is not among these, or was not made in that pose.
+        """
+        index = self._index[identities]
+        place = self._place[self._split[index], poses]
+        strangers = np.flatnonzero((index < 0) | (place < 0))
+        if len(strangers):
+            identity, pose = int(identities[strangers[0]]), int(poses[strangers[0]])
+            raise KeyError(f"identity {identity} in pose {pose} is not among the meshes of these identities")
+        return self._firsts[index] + place
+
+    def chunks(self) -> Iterator[NDArray[np.int64]]:
+        """Numbers of all meshes, in order, a few whole shards of one identity at a time."""
+        ends = np.append(np.flatnonzero(np.diff(self.shards)) + 1, len(self.shards))
+        first = last = 0
+        for end in ends.tolist():
+            size = 12 * self.counts[first] * (end - first)
+            if last > first and (self._owner[end - 1] != self._owner[first] or size > _CHUNK_BYTES):
+                yield np.arange(first, last)
+                first = last
+            last = end
+        yield np.arange(first, last)
+
+    def read(self, meshes: NDArray[np.int64], *, among: NDArray[np.int64] | None = None) -> Floats:
+        """Normalised vertices [mesh, vertex, 3] of some meshes of one identity, in ascending order.
+
+        Parameters
+        ----------
+        among
+            Read these, of which they are some; for where a whole shard is read more quickly than its parts.
+
+        Raises
+        ------
+        DatasetError
+            A shard is missing or damaged.
+        """
+        owner = int(self._owner[meshes[0]])
+        asked = meshes if among is None else among
+        poses = self.dataset.grid.poses_of(self.identities[owner])[asked - self._firsts[owner]]
+        found = self.dataset.vertices(self.identities[owner], poses)
+        return normalised(found if among is None else found[np.searchsorted(among, meshes)])
+
+
+def decode(layout: Layout, put: Callable[[int, Floats], None], *, sharers: int = 1) -> None:
+    """Read all meshes of a layout and hand runs of them to ``put``, in any order.
+
+    ``put`` gets the place of a run's first vertex and its normalised vertices [vertex, 3]. A few threads, the machine's
+    processors being divided among ``sharers`` processes; memory is bounded.
+
+    Raises
+    ------
+    DatasetError
+        A shard is missing or damaged.
+    """
+
+    def one(meshes: NDArray[np.int64]) -> None:
+        put(int(layout.starts[meshes[0]]), layout.read(meshes).reshape(-1, 3))
+
+    threads = max(1, min(_MOST_THREADS, (os.cpu_count() or 1) // sharers))
+    with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+        futures = [pool.submit(one, meshes) for meshes in layout.chunks()]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

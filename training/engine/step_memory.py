@@ -1,0 +1,65 @@
+"""What a training step takes at least: a recipe that no memory could hold is refused before any is taken.
+
+Linux grants memory that it does not have and kills who uses it, so that most of what is too large ends without a word
+otherwise.
+"""
+
+import math
+
+import torch
+
+from datagen.common.errors import RecipeError
+from datagen.common.resources import bytes_text
+from datagen.store import Dataset
+from training.data.cache_policy import device_room, memory_room
+from training.engine.distributed import Ranks
+from training.inference.predict import network_from
+from training.recipes.training import NetworkRecipe, TrainingRecipe
+
+_PARAMETER = 16
+"""Bytes of a parameter: itself, its gradient, the optimiser's two means."""
+_ACTIVATIONS = 3 * 4
+"""Bytes a vertex and channel that a step holds; measured: DSFFNet 3.1 to 5.6 float32, NPT 10 to 12, 3D-CoreNet 20."""
+_NARROW = 2_048
+"""Networks of no wider layers fit anywhere; to count the parameters of others exactly takes seconds."""
+
+
+def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, device: torch.device, ranks: Ranks) -> None:
+    """Refuse a recipe whose step needs more than the memory of this rank's device.
+
+    Raises
+    ------
+    RecipeError
+        It does; the message names what to lower.
+    """
+    most = max((dataset.vertex_count(identity) for identity in dataset.identities("training")), default=0)
+    meshes = math.ceil(recipe.batch / (ranks.count * recipe.accumulate))
+    widths = _widths(recipe.network)
+    weights = _PARAMETER * _parameters(recipe.network)
+    of_a_mesh = _ACTIVATIONS * sum(widths) * most
+    room = device_room(device) if device.type == "cuda" else memory_room()
+    sharers = 1 if device.type == "cuda" else ranks.here
+    if sharers * (weights + meshes * of_a_mesh) > room.free:
+        alone = sharers * (weights + of_a_mesh) > room.free
+        lower = "training.network's widths" if alone else "training.batch, or raise training.accumulate"
+        raise RecipeError(
+            f"a training step takes at least {bytes_text(sharers * (weights + meshes * of_a_mesh))} ({meshes:,} meshes "
+            f"of {most:,} vertices at a time, widths {', '.join(map(str, widths))}), but the {room.where} has "
+            f"{bytes_text(room.free)} free. Lower {lower}"
+        )
+
+
+def _widths(network: NetworkRecipe) -> list[int]:
+    values = network.model_dump().items()
+    return [width for name, widths in values if name.endswith("_widths") for width in widths]
+
+
+def _parameters(network: NetworkRecipe) -> float:
+    """How many parameters a network has; 0 of a narrow one, infinite where no computer could address them."""
+    if max(_widths(network)) <= _NARROW:
+        return 0
+    try:
+        with torch.device("meta"):
+            return sum(parameter.numel() for parameter in network_from(network).parameters())
+    except RuntimeError:
+        return math.inf

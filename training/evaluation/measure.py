@@ -1,0 +1,297 @@
+"""Every metric of outputs, and measuring some methods on one chunk of triples: the work of one task of an evaluation.
+
+The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
+(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple, dataclass, fields
+from functools import lru_cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from datagen.common.resources import memory_errors
+from datagen.grid import PoseType
+from datagen.mesh.geometry import bounding_box, edges_of
+from datagen.store import Dataset, open_dataset
+from training.data.batch import Batch, read_batch
+from training.evaluation.method_names import method_name, needs_equal_counts
+from training.evaluation.results import Row
+from training.inference.predict import load_trained, predict
+from training.objectives import metrics
+from training.recipes.training import EvaluationRecipe
+
+
+@dataclass(frozen=True)
+class Score:
+    """Metrics of one output, as the last fields of :class:`training.evaluation.results.Row`; NaN: not measured, or
+    not finite."""
+
+    pmd: float
+    pmd_recentred: float
+    chamfer: float
+    earth_mover: float
+    millimetres: float
+    edge_ratio: float
+    normal_degrees: float
+
+
+METRICS = tuple(field.name for field in fields(Score))
+NO_OPS = ("target unchanged", "source unchanged")
+POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A network to measure: its name in tables, and its weights.
+
+    ``weights``: a run, a checkpoint's folder or a file of weights
+    (see ``training.checkpoints.checkpoint.require_checkpoint``).
+    """
+
+    name: str
+    weights: str
+
+
+@dataclass(frozen=True)
+class Contender(Method):
+    """A method whose weights are known: by the checkpoint's own path and a hash of them. No-ops have neither."""
+
+    sha256: str = ""
+
+
+def evaluation_list(dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType) -> np.ndarray[Any, Any]:
+    """The first ``recipe.triples`` of the dataset's fixed list."""
+    return dataset.evaluation_triples(pose_type)[: recipe.triples]
+
+
+def measure_chunk(
+    contenders: Sequence[Contender], data: str, recipe: EvaluationRecipe, pose_type: PoseType, start: int
+) -> list[Row]:
+    """Rows of the triples [start, start + recipe.chunk) of one list, for each contender."""
+    advice = f"Lower evaluation.chunk (it is {recipe.chunk}) or evaluation.emd_points (it is {recipe.emd_points})"
+    with memory_errors(advice):
+        return _measured(contenders, open_dataset(data), recipe, pose_type, start)
+
+
+def _measured(
+    contenders: Sequence[Contender], dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType, start: int
+) -> list[Row]:
+    triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
+    batch, groups = read_batch(dataset, triples, padded=True), _groups(dataset, triples)
+    return [
+        Row(contender.name, pose_type, start + place, *map(int, triple), *astuple(score))
+        for contender in contenders
+        for place, (triple, score) in enumerate(
+            zip(triples, _measure_each(groups, _output(contender, batch), batch.truth, recipe), strict=True)
+        )
+    ]
+
+
+def _output(contender: Contender, batch: Batch) -> Tensor:
+    if contender.name in NO_OPS:
+        return batch.target if contender.name == NO_OPS[0] else batch.source
+    return predict(_network(contender.weights, contender.sha256), batch)
+
+
+@lru_cache(maxsize=8)
+def _network(weights: str, sha256: str) -> nn.Module:
+    """The network of weights, once a process; ``sha256`` tells weights apart that were written to one place."""
+    return load_trained(Path(weights))[0]
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Triples of one target identity in a chunk: their places, vertices, edges, faces, and metres a box unit is."""
+
+    places: list[int]
+    count: int
+    edges: Tensor
+    faces: Tensor
+    metres: Tensor
+
+
+def _groups(dataset: Dataset, triples: NDArray[np.integer]) -> list[_Group]:
+    return [_group(dataset, triples, identity) for identity in np.unique(triples[:, 2]).tolist()]
+
+
+def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Group:
+    places, faces = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.faces(identity)
+    metres = [float(bounding_box(dataset.vertices(identity, int(triples[place, 1]))).half) for place in places]
+    edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
+    return _Group(places, dataset.vertex_count(identity), edges, triangles, torch.tensor(metres, dtype=torch.float64))
+
+
+def _measure_each(groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe) -> list[Score]:
+    """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
+    found: dict[int, Score] = {}
+    for its in groups:
+        ours, right = output[its.places, : its.count], truth[its.places, : its.count]
+        about: dict[str, Any] = {"emd_points": recipe.emd_points, "seed": recipe.seed}
+        scores = measure(ours, right, edges=its.edges, faces=its.faces, metres=its.metres, **about)
+        found |= zip(its.places, scores, strict=True)
+    return [found[place] for place in range(len(found))]
+
+
+def measure(
+    output: Tensor,
+    truth: Tensor,
+    *,
+    edges: Tensor,
+    faces: Tensor,
+    metres: Tensor,
+    emd_points: int | None,
+    seed: int = 0,
+) -> list[Score]:
+    """Every metric of outputs for one target (see :mod:`training.objectives.metrics`).
+
+    Parameters
+    ----------
+    output, truth
+        ``[b, v, 3]`` in the normalised box, vertex by vertex.
+    edges, faces
+        ``[e, 2]`` and ``[f, 3]`` int64, the target's.
+    metres
+        ``[b]`` float64, what one unit of the box is for each truth.
+    emd_points, seed
+        Vertices of the earth mover's distance (None: it is not measured), and the seed they are drawn by.
+    """
+    columns = (
+        metrics.point_mesh_distance(output, truth),
+        metrics.recentred_point_mesh_distance(output, truth),
+        metrics.chamfer_distance(output, truth),
+        metrics.earth_mover_distance(output, truth, points=emd_points, seed=seed)
+        if emd_points
+        else torch.full((len(output),), torch.nan),
+        metrics.mean_euclidean_error(output, truth) * metres * 1000,
+        metrics.edge_length_ratio_error(output, truth, edges),
+        metrics.normal_angle_error(output, truth, faces),
+    )
+    return [Score(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
+
+
+_EQUAL_COUNTS = "NPT 'origin' pairs source and target vertex by vertex, so that it needs as many of both"
+_POINTS_AT_ONCE = 2**15  # source vertices and target vertices of pairs that go through a network together
+Vertices = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class LoadedMethod:
+    """A trained network in memory, under the name that tables and figures have for it.
+
+    :class:`training.evaluation.measure.Method` is one by the place of its weights alone. ``equal_counts`` says why it
+    takes no source of another vertex count than the target's ("": it takes any).
+    """
+
+    name: str
+    network: nn.Module
+    step: int
+    place: str
+    equal_counts: str = ""
+
+
+def load_methods(places: Sequence[Path], *, labels: Sequence[str]) -> list[LoadedMethod]:
+    """The networks of some weights, named as evaluations name them and, where that is not unique, by their label too.
+
+    Raises
+    ------
+    CheckpointError
+        A place has no usable weights.
+    """
+    loaded = [load_trained(place) for place in places]
+    titles = [method_name(recipe.network) for _, recipe, _ in loaded]
+    names = _told_apart(titles, labels)
+    return [
+        LoadedMethod(name, network, step, str(place), _EQUAL_COUNTS if needs_equal_counts(recipe.network) else "")
+        for name, place, (network, recipe, step) in zip(names, places, loaded, strict=True)
+    ]
+
+
+def _told_apart(titles: Sequence[str], labels: Sequence[str]) -> list[str]:
+    """Titles, with a label where two are alike, and with a number where the labels are alike as well."""
+    named = [
+        title if titles.count(title) == 1 else f"{title} {label}" for title, label in zip(titles, labels, strict=True)
+    ]
+    return [
+        name if named.count(name) == 1 else f"{name} ({named[: place + 1].count(name)})"
+        for place, name in enumerate(named)
+    ]
+
+
+def normalised(vertices: Vertices) -> NDArray[np.float32]:
+    """Vertices [v, 3] in the normalised box, computed in float64."""
+    exact = np.asarray(vertices, np.float64)
+    return bounding_box(exact).normalise(exact).astype(np.float32)
+
+
+@torch.no_grad()
+def transfer_each(network: nn.Module, pairs: Iterable[tuple[Vertices, Vertices]]) -> Iterator[NDArray[np.float64]]:
+    """Outputs [m, 3] in the normalised box for pairs of source [n, 3] and target [m, 3] in any unit, in their order.
+
+    Pairs of equal counts that follow each other go through the network together, as far as memory stays small.
+    """
+    for _, run in groupby(pairs, key=lambda pair: (len(pair[0]), len(pair[1]))):
+        alike = list(run)
+        at_once = max(1, _POINTS_AT_ONCE // (len(alike[0][0]) + len(alike[0][1])))
+        for start in range(0, len(alike), at_once):
+            part = alike[start : start + at_once]
+            output = network(source=_stacked([source for source, _ in part]), target=_stacked([its for _, its in part]))
+            yield from output.double().numpy()
+
+
+def _stacked(meshes: Sequence[Vertices]) -> Tensor:
+    return torch.from_numpy(np.stack([normalised(mesh) for mesh in meshes]))
+
+
+def score(
+    output: Vertices, truth: Vertices, faces: NDArray[np.integer], *, half: float, emd_points: int | None = None
+) -> Score:
+    """Every metric of one output (see :mod:`training.objectives.metrics`).
+
+    Parameters
+    ----------
+    output, truth
+        ``[v, 3]`` in the normalised box.
+    faces
+        ``[f, 3]``, the target's.
+    half
+        Metres that one unit of the box is for the truth.
+    emd_points
+        Vertices of the earth mover's distance; None: not measured (NaN).
+    """
+    ours, right = (torch.from_numpy(np.asarray(mesh, np.float64))[None] for mesh in (output, truth))
+    triangles = np.ascontiguousarray(faces, np.int64)
+    return measure(
+        ours,
+        right,
+        edges=torch.from_numpy(_edges(triangles.tobytes())),
+        faces=torch.from_numpy(triangles),
+        metres=torch.tensor([half], dtype=torch.float64),
+        emd_points=emd_points,
+    )[0]
+
+
+@lru_cache(maxsize=16)
+def _edges(faces: bytes) -> NDArray[np.int64]:
+    """Edges of int64 faces, which the triples of a topology share: sorting them takes longer than the metrics."""
+    return edges_of(np.frombuffer(faces, np.int64).reshape(-1, 3))
+
+
+def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Mean, and half the width of its 95 % interval: 1.96 standard errors (0 for one value)."""
+    numbers = np.asarray(values, np.float64)
+    if len(numbers) < 2:
+        return float(numbers.mean()) if len(numbers) else float("nan"), 0.0
+    return float(numbers.mean()), float(1.96 * numbers.std(ddof=1) / np.sqrt(len(numbers)))
+
+
+def in_words(score: Score) -> str:
+    """PMD and millimetres, for a caption."""
+    pmd = score.pmd * 1e4
+    return f"PMD {pmd:.{1 if pmd < 99.95 else 0}f}e-4, {score.millimetres:.0f} mm"

@@ -1,0 +1,201 @@
+"""Size and inference time of networks (DSFFNet, Table 2), measured side by side on one pair of meshes."""
+
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from datagen.common.errors import EvaluationError
+from training.data.batch import Batch
+from training.evaluation.evaluate import Method, require_pairable
+from training.inference.predict import load_trained, predict
+
+_KIBIBYTE = 1024
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What one network costs.
+
+    Attributes
+    ----------
+    parameters
+        Learned numbers.
+    kilobytes
+        A file of its weights in float32 (buffers included), in units of 1,024 bytes.
+    seconds
+        Median time of one pair over the rounds, weights loaded and kernels warm; meshes are where the network is.
+    mean
+        Mean over the rounds, which the paper states; one round that the machine was busy in weighs on it.
+    fastest, slowest
+        The shortest and the longest round, in seconds.
+    source_vertices, target_vertices
+        Of the pair.
+    rounds, threads, device
+        How often, on how many CPU threads of torch, and where.
+    """
+
+    parameters: int
+    kilobytes: float
+    seconds: float
+    fastest: float
+    slowest: float
+    source_vertices: int
+    target_vertices: int
+    rounds: int
+    threads: int
+    device: str
+    mean: float = float("nan")
+
+
+def measure_inference(
+    methods: Sequence[Method],
+    *,
+    vertices: int | Batch,
+    repeats: int = 20,
+    warm_up: int = 3,
+    threads: int | None = None,
+    device: torch.device | str = "cpu",
+) -> dict[str, Inference]:
+    """Time one pair through each network in this process, the networks taking turns round by round.
+
+    Taking turns spreads whatever else the machine does over all of them; which comes first moves on with every round.
+    The call is the one that an evaluation makes (:func:`training.inference.predict.predict`), in float32.
+
+    Parameters
+    ----------
+    methods
+        Networks by name and weights; all are held in memory at once.
+    vertices
+        Vertices of both meshes, which are then random points (no network does more work for one mesh than for another
+        of its size), or a batch whose first pair is taken.
+    repeats, warm_up
+        Rounds that count, and those before them that do not.
+    threads
+        CPU threads of torch while measuring; None: as many as it has.
+    device
+        Where to run.
+
+    Raises
+    ------
+    EvaluationError
+        A network cannot take the pair, or two have one name.
+    CheckpointError
+        Weights are missing or damaged.
+    ValueError
+        ``repeats`` or ``vertices`` is less than one.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats must be positive, got {repeats}")
+    pair = _random_pair(vertices) if isinstance(vertices, int) else _first_pair(vertices)
+    networks = {method.name: _loaded(method, pair).to(device) for method in _distinct(methods)}
+    with _threads(threads) as used:
+        seconds = _interleaved(networks, pair.to(device), repeats=repeats, warm_up=warm_up)
+    return {
+        name: Inference(
+            parameters=sum(weight.numel() for weight in network.parameters()),
+            kilobytes=_kilobytes(network),
+            seconds=statistics.median(seconds[name]),
+            fastest=min(seconds[name]),
+            slowest=max(seconds[name]),
+            source_vertices=pair.source.shape[1],
+            target_vertices=pair.target.shape[1],
+            rounds=repeats,
+            threads=used,
+            device=_device_name(torch.device(device)),
+            mean=statistics.fmean(seconds[name]),
+        )
+        for name, network in networks.items()
+    }
+
+
+def _distinct(methods: Sequence[Method]) -> Sequence[Method]:
+    names = [method.name for method in methods]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise EvaluationError(f"two methods are called {twice[0]!r}: give each a name of its own")
+    return methods
+
+
+def _loaded(method: Method, pair: Batch) -> nn.Module:
+    network, recipe, _ = load_trained(Path(method.weights))
+    counts = pair.source.shape[1], pair.target.shape[1]
+    require_pairable(method.name, recipe.network, *counts, where="the pair that is timed")
+    return network
+
+
+def _random_pair(vertices: int) -> Batch:
+    if vertices < 1:
+        raise ValueError(f"vertices must be positive, got {vertices}")
+    draw = torch.Generator().manual_seed(0)
+    source, target = (torch.rand(1, vertices, 3, generator=draw) * 2 - 1 for _ in range(2))
+    return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64))
+
+
+def _first_pair(batch: Batch) -> Batch:
+    """The first pair of a batch, without padding."""
+    pair = batch.part(0, 1)
+    source, target = (_unpadded(mesh, counts) for mesh, counts in _meshes(pair))
+    return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64))
+
+
+def _meshes(pair: Batch) -> list[tuple[Tensor, tuple[int, ...] | None]]:
+    return [(pair.source, pair.source_counts), (pair.target, pair.target_counts)]
+
+
+def _unpadded(mesh: Tensor, counts: tuple[int, ...] | None) -> Tensor:
+    return mesh[:, : counts[0]] if counts else mesh
+
+
+def _interleaved(networks: dict[str, nn.Module], pair: Batch, *, repeats: int, warm_up: int) -> dict[str, list[float]]:
+    seconds: dict[str, list[float]] = {name: [] for name in networks}
+    order = list(networks)
+    for turn in range(-warm_up, repeats):
+        for name in order:
+            taken = _seconds(networks[name], pair)
+            if turn >= 0:
+                seconds[name].append(taken)
+        order = [*order[1:], *order[:1]]
+    return seconds
+
+
+def _seconds(network: nn.Module, pair: Batch) -> float:
+    _wait(pair.source.device)
+    before = time.perf_counter()
+    predict(network, pair)
+    _wait(pair.source.device)
+    return time.perf_counter() - before
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@contextmanager
+def _threads(wanted: int | None) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(wanted or before)
+    try:
+        yield torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+
+def _kilobytes(network: nn.Module) -> float:
+    """A safetensors file of the weights in float32, spectral norms' vectors and other buffers included."""
+    weights = {
+        name: value.detach().cpu().float().contiguous() if value.is_floating_point() else value.cpu()
+        for name, value in network.state_dict().items()
+    }
+    return len(save(weights)) / _KIBIBYTE
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)

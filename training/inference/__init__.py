@@ -1,0 +1,1 @@
+"""Using a trained network: prediction, transfer of mesh files, the registered model."""

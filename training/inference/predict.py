@@ -1,0 +1,70 @@
+"""Networks from recipes and checkpoints, and running them over meshes."""
+
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
+from training.checkpoints.compat import recipe_of
+from training.checkpoints.weights import fill_network
+from training.data.batch import Batch
+from training.networks import build_network
+from training.networks.execution import GraphedTransfer
+from training.networks.padded_batches import MixedCounts
+from training.recipes.training import NetworkRecipe, TrainingRecipe
+
+_MESHES_AT_ONCE = 8
+
+
+def network_from(recipe: NetworkRecipe) -> nn.Module:
+    """The network that a recipe describes, freshly initialised."""
+    return build_network(recipe.name, **recipe.model_dump(exclude={"name"}))
+
+
+def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, TrainingRecipe, int]:
+    """The network of a run with its weights, the recipe it was trained by, and the step.
+
+    The weights are the newest sound ones or, where early stopping ended the run, the best; or those of ``which``.
+
+    Raises
+    ------
+    CheckpointError
+        The run has no usable checkpoint, or its network is none of this version.
+    """
+    checkpoint = require_checkpoint(run, which)
+    recipe = recipe_of(checkpoint, network_only=True)
+    network = network_from(recipe.network)
+    load_weights(network, checkpoint)
+    return network.eval(), recipe, checkpoint.step
+
+
+def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
+    """Give a network the weights of a checkpoint, their moving average where it keeps one.
+
+    Raises
+    ------
+    CheckpointError
+        They are another network's.
+    """
+    fill_network(network, checkpoint.weights(average=True), where=str(checkpoint.path))
+
+
+@torch.no_grad()
+def predict(network: nn.Module, batch: Batch) -> Tensor:
+    """Output vertices [batch, vertex, 3] in float32 precision, a few meshes at a time so that memory stays bounded.
+
+    Rows behind a mesh's count are zero. On a GPU a single pair whose shapes have come before is replayed (see
+    :class:`GraphedTransfer`).
+    """
+    parts = [batch.part(start, start + _MESHES_AT_ONCE) for start in range(0, len(batch), _MESHES_AT_ONCE)]
+    if batch.source_counts or batch.target_counts:
+        return torch.cat([_predict_mixed(MixedCounts(network), part) for part in parts])
+    transfer = GraphedTransfer(network)
+    return torch.cat([transfer(source=part.source, target=part.target) for part in parts])
+
+
+def _predict_mixed(network: MixedCounts, batch: Batch) -> Tensor:
+    counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
+    return cast(Tensor, network(source=batch.source, target=batch.target, **counts))

@@ -1,0 +1,154 @@
+"""Pose transfer for a person's own meshes: a mesh in the wanted pose and a mesh of the wanted identity in, one out."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
+from training.inference.orientation import UPRIGHT, Axes
+from training.inference.placement import Path as SourcePath
+from training.inference.placement import placed, scale_of
+from training.inference.predict import load_trained
+from training.inference.refinement import Refinement
+from training.inference.smoothing import smoothed
+from training.networks.execution import GraphedTransfer, Precision
+from training.objectives.metrics import point_mesh_distance
+
+Floats = NDArray[np.floating]
+_VERTICES_AT_ONCE = 8192  # of self-transfers, so that memory stays bounded
+
+
+class PoseTransfer:
+    """A trained network with the normalisation around it.
+
+    >>> transfer = PoseTransfer.from_run("runs/quickstart/run")        # doctest: +SKIP
+    >>> source, target = read_mesh_file("pose.obj"), read_mesh_file("person.obj")    # doctest: +SKIP
+    >>> posed = transfer(source=source.mesh, target=target.mesh)    # doctest: +SKIP
+    >>> write_posed(target, posed.vertices, Path("posed.obj"))      # doctest: +SKIP
+    >>> for frame in transfer.sequence(walk, target.mesh, smooth=7): ...    # doctest: +SKIP
+    """
+
+    def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:
+        """Use a network where it is; on a GPU shapes that come again are replayed (see :class:`GraphedTransfer`)."""
+        self._transfer = GraphedTransfer(network.eval(), precision=precision)
+        self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
+
+    @classmethod
+    def from_run(cls, run: str | Path, *, device: torch.device | str | None = None) -> "PoseTransfer":
+        """The network of a run folder, with the weights that are its result (CheckpointError where there are none).
+
+        It runs on ``device``; by default on a GPU where there is one.
+        """
+        device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        return cls(load_trained(Path(run))[0].to(device))
+
+    def __call__(
+        self,
+        *,
+        source: Mesh,
+        target: Mesh,
+        source_axes: Axes = UPRIGHT,
+        target_axes: Axes = UPRIGHT,
+        refine: float = 0.0,
+    ) -> Mesh:
+        """The target's identity in the source's pose.
+
+        Parameters
+        ----------
+        source, target
+            Meshes that may differ in vertices, faces, size and position.
+        source_axes, target_axes
+            How each of them stands; by default as the training data does, Y up and facing +Z.
+        refine
+            Weight of the target's edges in :class:`training.inference.refinement.Refinement`; 0 leaves the network's
+            output.
+
+        Returns
+        -------
+        Mesh
+            The target's faces, and its vertices moved, in the target's order, axes and unit: edges keep the length that
+            they have in the target (median over edges), and it stands where the target stands
+        (training.inference.placement).
+
+        Raises
+        ------
+        MeshError
+            A mesh cannot be used; the message names which.
+        """
+        check_mesh(source, name="source")
+        return next(self.sequence([source], target, source_axes=source_axes, target_axes=target_axes, refine=refine))
+
+    def sequence(
+        self,
+        sources: Iterable[Mesh],
+        target: Mesh,
+        *,
+        smooth: int = 0,
+        refine: float = 0.0,
+        source_axes: Axes = UPRIGHT,
+        target_axes: Axes = UPRIGHT,
+    ) -> Iterator[Mesh]:
+        """The target in the pose of each source, one after the other; memory holds one window of frames.
+
+        Every source is normalised by its own box, as each was in training: with one box for all, a body that crouches
+        or has walked away would be a small one in a corner, such as no network has seen. What the boxes take away, the
+        way through space, is given back (:class:`training.inference.placement.Path`).
+
+        Parameters
+        ----------
+        sources
+            Frames, evenly spaced in time; read as they are needed.
+        target
+            The identity; its own pose does not matter.
+        smooth
+            Frames of a Savitzky-Golay window along time (:mod:`training.inference.smoothing`); 0 smooths nothing.
+        refine, source_axes, target_axes
+            As calling.
+
+        Raises
+        ------
+        MeshError
+            While iterating: a mesh cannot be used.
+        """
+        check_mesh(target, name="target")
+        upright = Mesh(target_axes.turned(target.vertices), target.faces)
+        frames: Iterator[Floats] = smoothed(self._frames(sources, upright, source_axes), smooth)
+        refinement = Refinement(upright, weight=refine) if refine else None
+        for vertices in frames:
+            finished = refinement(vertices) if refinement else vertices
+            yield Mesh(target_axes.restored(finished), target.faces)
+
+    def pose(self, source: Floats, target: Mesh) -> Mesh:
+        """As calling, from the source's vertices [n, 3] alone; meshes are taken to be usable."""
+        return Mesh(placed(target, self.vertices(source, target.vertices)), target.faces)
+
+    @torch.no_grad()
+    def vertices(self, source: Floats, target: Floats) -> NDArray[np.float64]:
+        """Posed vertices [n_target, 3] in the normalised box, from vertices [n_source, 3] and [n_target, 3]."""
+        pair = [bounding_box(mesh).normalise(mesh).astype(np.float32)[None] for mesh in (source, target)]
+        inputs = [torch.from_numpy(mesh).to(self._device) for mesh in pair]
+        output = self._transfer(source=inputs[0], target=inputs[1])
+        return output[0].double().cpu().numpy()
+
+    @torch.no_grad()
+    def self_errors(self, meshes: Floats) -> NDArray[np.float64]:
+        """PMD [b] of meshes [b, n, 3] in the normalised box, each transferred onto itself."""
+        at_once = max(1, _VERTICES_AT_ONCE // meshes.shape[1])
+        parts = torch.split(torch.from_numpy(np.ascontiguousarray(meshes, np.float32)), at_once)
+        found = [
+            point_mesh_distance(self._transfer(source=p, target=p), p) for p in (q.to(self._device) for q in parts)
+        ]
+        return torch.cat(found).double().cpu().numpy()
+
+    def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Axes) -> Iterator[Floats]:
+        """Placed vertices [n_target, 3] of each frame, Y up."""
+        path: SourcePath | None = None
+        for number, source in enumerate(sources):
+            vertices = axes.turned(check_mesh(source, name=f"source {number}").vertices)
+            output = self.vertices(vertices, target.vertices)
+            path = path or SourcePath.from_first(vertices, scale_of(target, output))
+            yield placed(target, output) + path.offset(vertices)

@@ -1,0 +1,1 @@
+"""Typed recipes of training, networks and evaluation."""

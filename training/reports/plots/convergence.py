@@ -1,0 +1,195 @@
+"""Figure 4 of the DSFFNet paper: PMD of several methods while they learn, over iterations and over time."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from datagen.common.errors import CheckpointError
+from datagen.common.files import resolve_within
+from training.recipes.files import recipe_in
+from training.reports.plots.sweep import PMD_UNIT, RunCurve, run_curve, spread
+from training.tracking.journal import read_journal
+from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
+
+_LEFT, _AXES, _HEIGHT, _TOP, _BOTTOM, _LETTER = 0.62, 3.7, 3.1, 0.52, 0.5, 0.068  # inches
+_LABEL_POINTS = 11.0
+_STYLES: Mapping[str, dict[str, Any]] = {
+    "training": {"linewidth": 0.5, "alpha": 0.4},
+    "seen": {"linewidth": 1.3, "linestyle": (0, (2.2, 1.4))},
+    "unseen": {"linewidth": 2.3, "solid_capstyle": "round"},
+}
+_MEANING = {"training": "training batches", "seen": "evaluation, seen poses", "unseen": "evaluation, unseen poses"}
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How a method learned: PMD (box^2) of training batches and of the evaluation's seen and unseen poses."""
+
+    name: str
+    training: RunCurve
+    seen: RunCurve
+    unseen: RunCurve
+
+    @property
+    def final(self) -> RunCurve:
+        """The curve that is named at its end: unseen poses or, where the data has none, what there is."""
+        return next((curve for curve in (self.unseen, self.seen) if len(curve)), self.training)
+
+
+def learning_of(name: str, run: Path) -> Learning:
+    """Read how a run learned from its journal.
+
+    The training's PMD is its reconstruction loss over 3: that is a sum over coordinates and PMD a mean
+    (:func:`training.objectives.losses.reconstruction_loss`, :func:`training.objectives.metrics.point_mesh_distance`).
+    The journal has the loss before it is weighted.
+
+    Raises
+    ------
+    CheckpointError
+        The folder has no journal or no recipe.
+    RecipeError
+        Its recipe cannot be read.
+    """
+    rows = read_journal(run / "metrics.jsonl")
+    if not rows or not (run / "recipe.yaml").is_file():
+        raise CheckpointError(
+            f"{run} ({name}) is no folder of a run: it lacks metrics.jsonl or recipe.yaml. Train it first"
+        )
+    batch = recipe_in(resolve_within(run, "recipe.yaml")).batch
+    loss, seen, unseen = (
+        _drawable(run_curve(rows, key, batch=batch, name=name))
+        for key in ("loss/reconstruction", "evaluation/pmd_seen", "evaluation/pmd_unseen")
+    )
+    return Learning(name, replace(loss, pmd=loss.pmd / 3), seen, unseen)
+
+
+def convergence_figure(
+    runs: Mapping[str, Path],
+    path: str | os.PathLike[str],
+    *,
+    title: str = "",
+    baselines: Mapping[str, float] | None = None,
+) -> Path:
+    """Draw PMD over iterations and over seconds of training: thin of each logged batch, thick of the evaluations.
+
+    Parameters
+    ----------
+    runs : dict
+        Name of a method -> folder of its run. Names of `METHOD_COLORS` have a fixed colour.
+    path : path of the PNG to write
+    title : str
+    baselines : dict, optional
+        Name -> PMD (box^2) on unseen poses of doing nothing, drawn as dashed lines.
+
+    Raises
+    ------
+    ValueError
+        If no run has a value to draw.
+    CheckpointError
+        If a folder is none of a run.
+    """
+    learned = [learning_of(name, folder) for name, folder in runs.items()]
+    learned = [one for one in learned if len(one.final)]
+    if not learned:
+        raise ValueError(f"no run has a PMD to draw: {', '.join(map(str, runs.values())) or 'none was given'}")
+    figure, panels = _page(max(len(_label(one)) for one in learned), title)
+    for axes, over in zip(panels, ("steps", "seconds"), strict=True):
+        _draw_panel(axes, learned, over, baselines or {})
+    _legend(figure, panels[0], learned)
+    for axes, over in zip(panels, ("steps", "seconds"), strict=True):  # the shared limits are known only now
+        _name_ends(axes, learned, over)
+    return saved(figure, path)
+
+
+def _drawable(curve: RunCurve) -> RunCurve:
+    shown = np.isfinite(curve.pmd) & (curve.pmd > 0)
+    return replace(curve, steps=curve.steps[shown], seconds=curve.seconds[shown], pmd=curve.pmd[shown])
+
+
+def _page(letters: int, title: str) -> tuple[Figure, list[Axes]]:
+    """Two panels beside each other, each with room for names of so many letters at its right."""
+    names = 0.3 + letters * _LETTER
+    width, height = _LEFT + 2 * (_AXES + names) + 0.25, _TOP + _HEIGHT + _BOTTOM
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAGE)
+    lefts = (_LEFT, _LEFT + _AXES + names + 0.25)
+    panels: list[Axes] = []
+    for left in lefts:
+        box = (left / width, _BOTTOM / height, _AXES / width, _HEIGHT / height)
+        panels.append(figure.add_axes(box, sharey=panels[0] if panels else None))
+    figure.text(_LEFT / width, 1 - 0.18 / height, title, fontsize=9, weight="bold", color=INK, parse_math=False)
+    return figure, panels
+
+
+def _draw_panel(axes: Axes, learned: Sequence[Learning], over: str, baselines: Mapping[str, float]) -> None:
+    colors = method_colors([one.name for one in learned])
+    for kind, style in _STYLES.items():
+        for one in learned:
+            curve: RunCurve = getattr(one, kind)
+            axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, color=colors[one.name], **style)
+    for name, level in baselines.items():
+        axes.axhline(level / PMD_UNIT, color=QUIET, linewidth=0.8, linestyle=(0, (5, 3)), zorder=0)
+        axes.annotate(
+            name, (0.99, level / PMD_UNIT), xycoords=("axes fraction", "data"), xytext=(0, 2.5), ha="right",
+            textcoords="offset points", fontsize=6.5, color=QUIET, parse_math=False,
+        )  # fmt: skip
+    _styled(axes, learned)
+    axes.set_xlabel("iteration" if over == "steps" else "seconds of training", fontsize=8, color=INK, labelpad=2)
+    axes.set_ylabel("PMD (1e-4)" if over == "steps" else "", fontsize=8, color=INK, labelpad=2)
+
+
+def _styled(axes: Axes, learned: Sequence[Learning]) -> None:
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if high / low < 8 else (1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    axes.set_xlim(left=0)
+    axes.margins(x=0.01)
+    axes.tick_params(labelsize=7, colors=QUIET, which="both", width=0.5)
+    axes.grid(True, which="major", color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#b9c0c9")
+
+
+def _legend(figure: Figure, axes: Axes, learned: Sequence[Learning]) -> None:
+    """Say above the panels what thin, dashed and thick lines are, where there are any."""
+    kinds = [kind for kind in _STYLES if any(len(getattr(one, kind)) for one in learned)]
+    handles = [Line2D([], [], color=INK, label=_MEANING[kind], **_STYLES[kind]) for kind in kinds]
+    place = (axes.get_position().x0, 1 - 0.27 / figure.get_figheight())
+    figure.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=place, ncols=3, fontsize=7, frameon=False, labelcolor=INK,
+        borderaxespad=0, borderpad=0, handlelength=2.6,
+    )  # fmt: skip
+
+
+def _label(one: Learning) -> str:
+    return f"{one.final.final / PMD_UNIT:.3g}  {one.name}"
+
+
+def _name_ends(axes: Axes, learned: Sequence[Learning], over: str) -> None:
+    """Write value and name of each method beside the axes, at the height of its end but never over another."""
+    low, high = np.log(axes.get_ylim())
+    ranked = sorted(learned, key=lambda one: one.final.final)
+    ends = np.array([(np.log(one.final.final / PMD_UNIT) - low) / (high - low) for one in ranked])
+    colors = method_colors([one.name for one in learned])
+    for one, height in zip(ranked, spread(ends, _LABEL_POINTS / 72 / _HEIGHT), strict=True):
+        color, end = colors[one.name], (getattr(one.final, over)[-1], one.final.final / PMD_UNIT)
+        axes.annotate(
+            "", end, xycoords="data", xytext=(1.035, height), textcoords="axes fraction", annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.7, "linestyle": ":", "shrinkA": 0},
+        )  # fmt: skip
+        axes.text(
+            1.045, height, _label(one), transform=axes.transAxes, fontsize=7.5, va="center", color=color,
+            weight="bold" if one is ranked[0] else "normal", parse_math=False,
+        )  # fmt: skip

@@ -1,0 +1,177 @@
+"""Curves of metrics over disturbances as small multiples, and pictures of spoilt sources and what comes of them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from datagen.mesh.geometry import Mesh, bounding_box
+from training.evaluation.disturbances import DISTURBANCES, Disturbance
+from training.evaluation.measure import LoadedMethod, in_words, transfer_each
+from training.evaluation.robustness import Case, RobustnessRow, curve, disturbed, methods_in, no_op, refusal
+from training.viz.mesh_grid import Panel, Row, drawable, mesh_grid, standing
+from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, RULE, method_colors, saved, short
+
+_ABREAST = 5
+_BODY_METRES = 1.7
+
+
+def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str], *, title: str) -> Path:
+    """Draw mean PMD over the amount of each disturbance, a panel each, with 95 % intervals, on one log scale.
+
+    The dashed line is the no-op: the target returned unchanged.
+
+    Raises
+    ------
+    ValueError
+        The rows hold no disturbance.
+    """
+    shown = [its for its in DISTURBANCES if any(row.disturbance == its.name for row in rows)]
+    if not shown:
+        raise ValueError("there are no rows of a disturbance to draw")
+    across, down = min(_ABREAST, len(shown)), -(-len(shown) // _ABREAST)
+    figure = Figure(figsize=(2.3 * max(across, 2), 1.95 * down + 0.75), dpi=DPI, facecolor=PAGE, layout="constrained")
+    grid = figure.subplots(down, across, sharey=True, squeeze=False)
+    for axes, disturbance in zip(grid.ravel(), shown, strict=False):
+        _draw_curves(axes, rows, disturbance)
+    for axes in grid.ravel()[len(shown) :]:
+        axes.set_visible(False)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("PMD (1e-4)", fontsize=7.5, color=INK)
+    handles, names = grid[0, 0].get_legend_handles_labels()
+    figure.suptitle(title, fontsize=9, weight="bold", color=INK, x=0.01, ha="left", parse_math=False)
+    place = {"loc": "outside lower left", "ncols": 7, "frameon": False}
+    legend = figure.legend(handles, [short(name) for name in names], fontsize=7.5, labelcolor=INK, **place)
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # methods are called after folders
+    return saved(figure, path)
+
+
+def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturbance) -> None:
+    for name, color in method_colors(methods_in(rows)).items():
+        levels = curve(rows, name, disturbance.name)
+        at = [_place(disturbance, level.amount) for level in levels]
+        mean, half = (np.array([getattr(level, key) for level in levels]) * 1e4 for key in ("mean", "interval"))
+        axes.plot(at, mean, color=color, linewidth=1.6, marker="o", markersize=2.6, label=name)
+        axes.fill_between(at, np.maximum(mean - half, mean / 10), mean + half, color=color, alpha=0.18, linewidth=0)
+    if np.isfinite(no_op(rows)):
+        axes.axhline(no_op(rows) * 1e4, color=QUIET, linewidth=0.9, linestyle=(0, (5, 3)), label="target unchanged")
+    axes.set_title(disturbance.heading, fontsize=8, color=INK, loc="left", weight="bold", pad=4)
+    axes.set_xlabel(_unit(disturbance), fontsize=7, color=INK, labelpad=1)
+    axes.set_xticks([_place(disturbance, amount) for amount in _ticks(disturbance)])
+    axes.set_xticklabels([f"{amount:g}" for amount in _ticks(disturbance)])
+    _style(axes)
+
+
+def _place(disturbance: Disturbance, amount: float) -> float:
+    return disturbance.amounts.index(amount) if disturbance.even else amount
+
+
+def _ticks(disturbance: Disturbance) -> tuple[float, ...]:
+    """The amounts that are named along the axis: all at equal steps, else those far enough apart."""
+    if disturbance.even:
+        return disturbance.amounts
+    return tuple(_spaced(disturbance.amounts, 0.14 * disturbance.amounts[-1]))
+
+
+def _spaced(amounts: Sequence[float], apart: float) -> list[float]:
+    kept = [amounts[-1]]
+    for amount in reversed(amounts[:-1]):
+        if kept[-1] - amount >= apart:
+            kept.append(amount)
+    return kept[::-1]
+
+
+def _unit(disturbance: Disturbance) -> str:
+    if disturbance.name != "noise":
+        return disturbance.unit
+    return f"std (0.01 = {millimetres(0.01):.1f} mm on a body of {_BODY_METRES:g} m)"
+
+
+def millimetres(amount: float) -> float:
+    """Half box edges as millimetres on a body that is 1.7 m along its longest box edge."""
+    return 1000 * amount * _BODY_METRES / 2
+
+
+def _style(axes: Axes) -> None:
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.tick_params(labelsize=6.5, colors=QUIET, width=0.5)
+    axes.grid(True, color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#b9c0c9")
+
+
+def disturbance_picture(
+    case: Case,
+    methods: Sequence[LoadedMethod],
+    chosen: Sequence[tuple[Disturbance, float]],
+    path: str | os.PathLike[str],
+    *,
+    title: str,
+) -> Path:
+    """Draw the disturbed sources and, under them, each method's outputs; the target and the truth stand at the left.
+
+    The panels of a row share camera and scale. A source without faces is drawn as points.
+    """
+    truth = case.truth.vertices
+    sources = [disturbed(case, disturbance, amount) for disturbance, amount in chosen]
+    reference = Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], "target")
+    spoilt = [Panel(_stood(source), ROLE_COLORS["source"], _count(source)) for source in sources]
+    page = [Row("source", [reference, *spoilt])]
+    for number, method in enumerate(methods):
+        whole = Panel(Mesh(standing(truth), case.truth.faces), ROLE_COLORS["truth"], "ground truth")
+        panels: list[Panel | str] = ["" if number else whole]
+        for (disturbance, _), source in zip(chosen, sources, strict=True):
+            taken = not refusal(method, disturbance)
+            panels.append(_output(method, case, source) if taken else "needs as many\nvertices as the target")
+        page.append(Row(method.name.replace(" ", "\n", 1), panels))
+    headings = ["", *(_heading(its, amount) for its, amount in chosen)]
+    return mesh_grid(page, path, columns=headings, title=title, one_scale=False)
+
+
+def _heading(disturbance: Disturbance, amount: float) -> str:
+    words = disturbance.words.format(amount)
+    if disturbance.name == "noise":
+        return f"{words}\n{millimetres(amount):.0f} mm at {_BODY_METRES:g} m" if amount else "no noise\n"
+    return f"{disturbance.heading}\n{words}"
+
+
+def _output(method: LoadedMethod, case: Case, source: Mesh) -> Panel:
+    (output,) = transfer_each(method.network, [(source.vertices, case.target.vertices)])
+    found = case.score(output)
+    vertices = standing(bounding_box(case.truth.vertices).restore(output), case.truth.vertices)
+    caption = in_words(found)
+    return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
+
+
+def _stood(mesh: Mesh) -> Mesh:
+    shown = drawable(mesh)
+    return Mesh(standing(shown.vertices), shown.faces)
+
+
+def _count(mesh: Mesh) -> str:
+    return f"{len(mesh.vertices):,} {'vertices' if len(mesh.faces) else 'points'}"
+
+
+def noise_levels() -> list[tuple[Disturbance, float]]:
+    """What the picture like the paper's Figure 9 shows: noise of growing amplitude."""
+    noise = next(its for its in DISTURBANCES if its.name == "noise")
+    return [(noise, amount) for amount in noise.amounts if amount != 0.01]
+
+
+def one_of_each() -> list[tuple[Disturbance, float]]:
+    """A telling amount of every disturbance that changes the source's shape or stance."""
+    amounts = {
+        "patch": 0.3, "side": 0.6, "subset": 0.75, "cells": 0.15, "area": 4, "face": 4, "turn-x": 30, "turn-y": 45,
+        "turn-z": 30,
+    }  # fmt: skip
+    return [(its, amounts[its.name]) for its in DISTURBANCES if its.name in amounts]

@@ -1,0 +1,234 @@
+"""Reports: one self-contained HTML file and one Markdown file a workflow, from blocks that every workflow shares.
+
+>>> section = Section("Results", (Table([["method", "PMD"], ["ours", "**1.2**"]], "Main results"),))
+>>> write_report(folder, title="A comparison", lead="On **8** new identities.", sections=[section])  # doctest: +SKIP
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from datagen.common.errors import ReportError
+from datagen.common.files import read_text_within, write_atomically
+from datagen.common.printable import printable_lines
+from datagen.store import Dataset, open_dataset
+from training.checkpoints.checkpoint import require_checkpoint
+from training.checkpoints.compat import recipe_of
+from training.evaluation.evaluate import Row, read_rows
+from training.evaluation.tables import mean_of, methods_of
+from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, shown, with_best
+from training.reports.card_texts import NETWORKS, span, vertex_counts
+from training.reports.cards import dataset_card, model_card
+from training.reports.html import report_html
+from training.reports.markdown import report_markdown
+from training.reports.markup import document_blocks, plain
+from training.reports.run_summary import this_commit, this_machine, what_was_run
+from training.tracking.record import read_record
+
+__all__ = [
+    "NAMES",
+    "Block",
+    "Code",
+    "Facts",
+    "Page",
+    "Picture",
+    "ReportError",
+    "Section",
+    "Table",
+    "Text",
+    "dataset_card",
+    "document_blocks",
+    "model_card",
+    "pictures_of",
+    "plain",
+    "report_is_current",
+    "report_of_sweep",
+    "this_commit",
+    "this_machine",
+    "what_was_run",
+    "with_best",
+    "workflow_report",
+    "write_report",
+]
+
+NAMES = ("report.html", "report.md")
+"""What :func:`workflow_report` leaves in a folder."""
+
+CAPTIONS = {
+    "examples": "Source, target, output, ground truth and error: the first triples of each fixed list, not chosen "
+    "by result.",
+    "training-curve": "Losses, PMD on fixed evaluation triples, and the learning rate, over the steps of training.",
+    "sweep": "PMD on unseen poses over steps and over seconds of training.",
+    "adaptive-coefficients": "The adaptive coefficients of each FFAdaIN: 0, the target's own features modulate alone; "
+    "1, those mixed with the source's pose code.",
+}
+"""File name of a figure, without its ending -> caption (markup)."""
+
+
+def write_report(
+    folder: Path, *, title: str, lead: str, sections: Sequence[Section], name: str = "report"
+) -> tuple[Path, Path]:
+    """Write FOLDER/NAME.html, which holds its pictures, and FOLDER/NAME.md, which links them; each whole or not at all.
+
+    Parameters
+    ----------
+    folder
+        Where the report goes; pages and, in Markdown, pictures are linked relative to it.
+    title, lead
+        Plain text; markup (see :mod:`training.reports.markup`) of what a hurried reader is to know.
+    sections
+        In their order; the HTML lists their titles.
+
+    Raises
+    ------
+    ReportError
+        A picture is missing or of a format that browsers do not show.
+    StorageError
+        It could not be written.
+    """
+    texts = {
+        folder / f"{name}.html": printable_lines(report_html(folder, title=title, lead=lead, sections=sections)),
+        folder / f"{name}.md": printable_lines(report_markdown(folder, title=title, lead=lead, sections=sections)),
+    }
+    for path, text in texts.items():
+        write_atomically(path, text.encode())
+    html, markdown = texts
+    return html, markdown
+
+
+def workflow_report(out: Path) -> tuple[Path, Path]:
+    """The report of what ``workflows/full.py`` leaves in ``out``: what was run, tables, figures, curves, cards.
+
+    Raises
+    ------
+    ReportError
+        There is no workflow's record, or no evaluation.
+    DatasetError, CheckpointError
+        The dataset is missing or incomplete, or the run has no usable checkpoint.
+    """
+    evaluation, record = out / "run" / "evaluation", read_record(out)
+    if record is None or not (evaluation / "rows.csv").is_file():
+        missing = "run/evaluation/rows.csv" if record else "record.json"
+        raise ReportError(f"{out} holds no finished workflow (no {missing}). Finish it with workflows/full.py")
+    dataset, rows = open_dataset(str(out / "dataset.zarr")), read_rows(evaluation / "rows.csv")
+    sections = [
+        what_was_run(out),
+        Section("Results", _tables(evaluation / "tables.md")),
+        Section("Examples", (*pictures_of(evaluation / "figures", but=("training-curve",)), *_viewer(evaluation))),
+        Section("Training", _curves(out / "run")),
+        dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
+        model_card(out / "run", dataset, rows),
+        _files(out),
+    ]
+    sections = [section for section in sections if section.body]
+    return write_report(out, title=_title(record.name, dataset), lead=_lead(out, dataset, rows), sections=sections)
+
+
+def report_of_sweep(out: Path) -> tuple[Path, Path]:
+    """The report of what ``dsffnet sweep`` leaves in ``out``, also while trials still run: table, figure, trials, data.
+
+    Raises
+    ------
+    ReportError
+        There is no sweep's table.
+    DatasetError
+        The dataset is missing or incomplete.
+    """
+    table, record = out / "sweep.md", read_record(out)
+    if record is None or not table.is_file():
+        missing = table.name if record else "record.json"
+        raise ReportError(
+            f"{out} holds no sweep (no {missing}). Begin one: dsffnet sweep --trials networks --out {out}"
+        )
+    dataset = open_dataset(str(out / "dataset.zarr"))
+    results = (*document_blocks(read_text_within(out, table.name)), *pictures_of(out / "figures"))
+    sections = [
+        Section("Results", results),
+        what_was_run(out),
+        dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
+    ]
+    counts = span(vertex_counts(dataset))
+    lead = f"Trainings side by side on {plain(dataset.recipe.body.family)} bodies of {counts} vertices, best first."
+    return write_report(out, title=f"Sweep {record.name}", lead=lead, sections=sections)
+
+
+def report_is_current(out: Path) -> bool:
+    """Whether both files are there and younger than the evaluation that they tell of."""
+    record = read_record(out / "run" / "evaluation")
+    paths = [out / name for name in NAMES]
+    if record is None or record.ended is None or not all(path.is_file() for path in paths):
+        return False
+    return all(path.stat().st_mtime * 1000 >= record.ended for path in paths)
+
+
+def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]:
+    """The PNG files of a folder by name, except some stems, with the captions that are known of them."""
+    paths = [path for path in sorted(folder.glob("*.png")) if path.stem not in but]
+    return tuple(Picture(path, CAPTIONS.get(path.stem, plain(path.stem.replace("-", " ")))) for path in paths)
+
+
+def _tables(path: Path) -> tuple[Block, ...]:
+    """The tables of an evaluation, with its definitions as it wrote them; the best values are marked."""
+    blocks = document_blocks(read_text_within(path.parent, path.name))
+    return tuple(_marked(block) if isinstance(block, Table) else block for block in blocks)
+
+
+def _marked(table: Table) -> Table:
+    columns = [place for place, numeric in enumerate(table.numeric) if numeric]
+    group = 0 if not table.numeric[0] else None
+    lines = with_best(table.lines, columns=columns, group=group)
+    return replace(table, lines=lines, notes=table.notes or "The best of each column and group of poses in bold.")
+
+
+def _viewer(evaluation: Path) -> tuple[Page, ...]:
+    path = evaluation / "viewer.html"
+    words = "The same examples, to be turned with the mouse: drag to turn, wheel or pinch to zoom."
+    return (Page(path, words),) if path.is_file() else ()
+
+
+def _curves(run: Path) -> tuple[Picture, ...]:
+    """The training curve, with the no-op baselines where the evaluation drew it, and the run's other figures."""
+    measured = [Picture(path, CAPTIONS[path.stem]) for path in _existing(run / "evaluation/figures/training-curve.png")]
+    return (*measured, *pictures_of(run / "figures", but=("training-curve",) if measured else ()))
+
+
+def _existing(*paths: Path) -> list[Path]:
+    return [path for path in paths if path.is_file()]
+
+
+def _title(name: str, dataset: Dataset) -> str:
+    counts = span(vertex_counts(dataset))
+    return f"{name}: pose transfer on {dataset.recipe.body.family} bodies of {counts} vertices"
+
+
+def _lead(out: Path, dataset: Dataset, rows: list[Row]) -> str:
+    checkpoint = require_checkpoint(out / "run", "result")
+    network, method = recipe_of(checkpoint).network.name, methods_of(rows)[0]
+    grid, kind = dataset.grid, "unseen" if any(row.pose_type == "unseen" for row in rows) else "seen"
+    trained = (
+        f"{NETWORKS[network]}, {checkpoint.step:,} steps on {len(grid.identities('training'))} identities in "
+        f"{len(grid.poses('seen')):,} poses. "
+    )
+    scores = {each: mean_of(rows, method=each, pose_type=kind, field="pmd") * 1e4 for each in methods_of(rows)}
+    others = ", ".join(f"{plain(each)} {score:.2f}" for each, score in scores.items() if each != method)
+    error = mean_of(rows, method=method, pose_type=kind, field="millimetres")
+    return (
+        f"{trained}On new identities in {kind} poses: **PMD {scores[method]:.2f} x 1e-4, mean error {error:.1f} mm**. "
+        f"For comparison, doing nothing: {others} (PMD x 1e-4)."
+    )
+
+
+def _files(out: Path) -> Section:
+    names = {
+        "dataset.zarr": "the dataset",
+        "run": "the training run: name this folder where a model is asked for",
+        "run/metrics.jsonl": "the journal: losses, PMD, learning rate by step",
+        "run/evaluation/rows.csv": "every metric of every triple",
+        "run/evaluation/tables.md": "the tables above, with their definitions",
+        "run/evaluation/viewer.html": "the viewer",
+        "run/evaluation/meshes": "the examples as GLB files",
+        "recipe.yaml": "the whole recipe",
+    }
+    lines = [[path, what] for path, what in names.items() if (out / path).exists()]
+    words = f"Beside this report, in {plain(shown(out))}:"
+    return Section("Files", (Text(words), Table([["path", "what it is"], *lines])))

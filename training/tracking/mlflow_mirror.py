@@ -1,0 +1,410 @@
+"""The MLflow mirror of records (see :mod:`training.tracking.record`): the one place that talks to MLflow.
+
+``publish`` can be repeated at any time, after any outage or kill: what has been sent is noted in FOLDER/mlflow.json
+behind every call. What is sent twice all the same is there once: MLflow stores the same point (metric, step, time,
+value) once, and runs and models bear the record's id, by which they are found before they are made a second time.
+"""
+
+import hashlib
+import importlib.util
+import json
+import logging
+import os
+import re
+import shlex
+import shutil
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from datagen.common.errors import DsffnetError, TrackingError
+from datagen.common.files import lock_within, read_within, resolve_within
+from datagen.common.printable import printable, printable_lines
+from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
+from training.tracking.mlflow_store import prepare_store
+from training.tracking.record import ALIAS, EXPERIMENT, Record, Server, find_records, parent_of, read_record
+
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+os.environ.setdefault("MLFLOW_SKIP_PIP_REQUIREMENTS_CHECK", "true")
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+
+log = logging.getLogger(__name__)
+_ROOT = Path(__file__).parents[2]
+_PARENT_TAG, _RECORD_TAG, _WEIGHTS_TAG = "mlflow.parentRunId", "dsffnet.record", "dsffnet.weights"
+_METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER, _LONGEST_NAME = 900, 90, 5000, 250
+_LOCK_SECONDS = 120.0  # to wait for another process that publishes the same record, such as a sync by hand
+_NO_ANSWER = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "DEADLINE_EXCEEDED", "REQUEST_LIMIT_EXCEEDED")
+
+
+def publish(root: Path, server: Server) -> None:
+    """Bring the tracking server up to date with every record below ``root``, parents first.
+
+    Raises
+    ------
+    TrackingError
+        The server cannot be reached or refuses; repeat later.
+    """
+    if importlib.util.find_spec("mlflow") is None:
+        raise TrackingError(f"MLflow is not installed here. Where it is, {_how_to_sync(root, server)} sends {root}")
+    import mlflow
+
+    for chatty in ("mlflow", "alembic"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    failures: list[Exception] = []
+    try:
+        prepare_store(server)
+        mlflow.set_tracking_uri(server.uri)
+        client = mlflow.MlflowClient(server.uri)
+        for folder in find_records(root):
+            _publish_record(client, server, folder, failures)
+    except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
+        failures.append(error)
+    if failures:
+        log.debug("publishing %s failed", root, exc_info=failures[0])
+        reason = str(failures[0]) if isinstance(failures[0], DsffnetError) else _first_line(failures[0])
+        raise TrackingError(
+            f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
+            f"{_how_to_sync(root, server)} sends what is missing"
+        ) from failures[0]
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+def _how_to_sync(root: Path, server: Server | None) -> str:
+    uri = f" --tracking-uri {shlex.quote(server.uri)}" if server else ""
+    return f"dsffnet sync {shlex.quote(str(root))}{uri}"
+
+
+def _publish_record(client: Any, server: Server, folder: Path, failures: list[Exception]) -> None:
+    """Publish one record. What the server refuses about it is kept for the end, lest it keep back the others."""
+    from mlflow.exceptions import MlflowException
+
+    record = read_record(folder)
+    if record is None:
+        return
+    try:
+        with lock_within(folder, ".mlflow.lock").acquire(timeout=_LOCK_SECONDS):
+            _Publication(client, server, folder, record).run()
+    except MlflowException as error:
+        if error.error_code in _NO_ANSWER:
+            raise
+        failures.append(error)
+    except (DsffnetError, ArithmeticError, ValueError, LookupError, TypeError) as error:  # it holds what none can send
+        failures.append(error)
+
+
+class _Publication:
+    """What one record still has to send to one server."""
+
+    def __init__(self, client: Any, server: Server, folder: Path, record: Record) -> None:
+        self.client, self.server, self.folder, self.record = client, server, folder, record
+        self.sent = read_sent(folder, server.uri)
+
+    def run(self) -> None:
+        run = self._known_run()
+        if run is None:
+            run = self._find_or_create_run()
+            self.sent = {"run": run.info.run_id, "offsets": {}, "artifacts": {}}
+            self._note()
+        self._send_parameters(run.data)
+        if self.record.tags != self.sent.get("tags", {}):
+            self._send_tags()
+        if self.record.dataset:
+            self._once("dataset", self._send_dataset)
+        self._send_metrics()
+        self._send_artifacts()
+        if self.record.model and self.record.status == "FINISHED":
+            self._once("model", self._register_model)
+        if self.record.status != self.sent.get("status"):
+            self._send_status()
+
+    def _known_run(self) -> Any:
+        """The run that was noted, None where there is none or a person has deleted it."""
+        from mlflow.exceptions import MlflowException
+
+        if "run" not in self.sent:
+            return None
+        try:
+            run = self.client.get_run(self.sent["run"])
+            return run if run.info.lifecycle_stage == "active" else None
+        except MlflowException as error:
+            if error.error_code == "RESOURCE_DOES_NOT_EXIST":
+                return None
+            raise
+
+    def _find_or_create_run(self) -> Any:
+        """The run of this record, which a kill may have kept from being noted; a new one where there is none."""
+        experiment = _experiment(self.client, self.server)
+        if not self._runs_of_record(experiment):
+            self._create_run(experiment)
+        first, *doubles = self._runs_of_record(experiment)
+        for double in doubles:  # a request whose answer was lost is repeated below us, and each makes a run
+            if not double.data.metrics and not double.data.params:
+                self.client.delete_run(double.info.run_id)
+        return first
+
+    def _runs_of_record(self, experiment: str) -> list[Any]:
+        return list(
+            self.client.search_runs(
+                [experiment], f"tags.`{_RECORD_TAG}` = '{self._id}'", order_by=["attributes.start_time ASC"]
+            )
+        )
+
+    @property
+    def _id(self) -> str:
+        """The record's id; a record of an earlier version is told by its start."""
+        return self.record.id or f"{self.record.name} {self.record.started}"
+
+    def _create_run(self, experiment: str) -> None:
+        tags = {"kind": self.record.kind, _RECORD_TAG: self._id}
+        parent = parent_of(self.folder, self.record)
+        known = read_sent(parent, self.server.uri) if parent else {}
+        if known:  # a run that was copied away from its workflow stands alone
+            tags[_PARENT_TAG] = known["run"]
+        name = printable(self.record.name)[:_LONGEST_NAME]
+        self.client.create_run(experiment, start_time=self.record.started, run_name=name, tags=tags)
+
+    def _send_parameters(self, there: Any) -> None:
+        """Parameters that the server lacks; it lets none change, so what a resumed run has otherwise becomes a tag."""
+        from mlflow.entities import Param, RunTag
+
+        given = {_key(key): _value(value) for key, value in self.record.parameters.items()}
+        new = [Param(key, value) for key, value in given.items() if key not in there.params]
+        for start in range(0, len(new), _PARAMETERS_AT_ONCE):
+            self.client.log_batch(self.sent["run"], params=new[start : start + _PARAMETERS_AT_ONCE])
+        changed = {f"changed.{key}": value for key, value in given.items() if there.params.get(key, value) != value}
+        tags = [RunTag(key, value) for key, value in changed.items() if there.tags.get(key) != value]
+        if tags:
+            self.client.log_batch(self.sent["run"], tags=tags)
+
+    def _send_tags(self) -> None:
+        from mlflow.entities import RunTag
+
+        tags = [RunTag(_key(key), _value(value)) for key, value in self.record.tags.items()]
+        self.client.log_batch(self.sent["run"], tags=tags)
+        self._note(tags=self.record.tags)
+
+    def _send_dataset(self) -> None:
+        from mlflow.data.code_dataset_source import CodeDatasetSource
+        from mlflow.data.meta_dataset import MetaDataset
+        from mlflow.entities import DatasetInput, InputTag
+
+        about = self.record.dataset or {}
+        source = CodeDatasetSource(tags={key: printable(value) for key, value in about.items()})
+        name, digest = printable(about.get("name", "?"))[:_LONGEST_NAME], about.get("manifest_sha256", "?")[:36]
+        dataset = MetaDataset(source, name=name, digest=digest)
+        context = InputTag("mlflow.data.context", self.record.kind)
+        self.client.log_inputs(self.sent["run"], [DatasetInput(dataset._to_mlflow_entity(), [context])])
+
+    def _send_metrics(self) -> None:
+        from mlflow.entities import Metric
+
+        for name, offset, rows in unsent_rows(self.folder, self.sent["offsets"], values=_METRICS_AT_ONCE):
+            self._send_rows(rows)
+            self.sent["offsets"][name] = offset
+            self._note()
+        if self.record.metrics != self.sent.get("metrics", {}):
+            moment = self.record.measured or self.record.started  # not now: sent twice, it must be the same point
+            points = [Metric(_key(key), value, moment, 0) for key, value in self.record.metrics.items()]
+            self.client.log_batch(self.sent["run"], metrics=points)
+            self._note(metrics=self.record.metrics)
+
+    def _send_rows(self, rows: MetricRows) -> None:
+        from mlflow.entities import Metric
+
+        points = [
+            Metric(_key(key), float(value), int(row.get("time", 0) * 1000), row["step"])
+            for row in rows
+            for key, value in row.items()
+            if key not in ("time", "step")
+        ]
+        for start in range(0, len(points), _METRICS_AT_ONCE):
+            self.client.log_batch(self.sent["run"], metrics=points[start : start + _METRICS_AT_ONCE])
+
+    def _send_artifacts(self) -> None:
+        for path, name, stamp in unsent_artifacts(self.folder, self.record.artifacts, self.sent["artifacts"]):
+            self.client.log_artifact(self.sent["run"], str(path), os.path.dirname(name) or None)
+            self.sent["artifacts"][name] = stamp
+            self._note()
+
+    def _register_model(self) -> None:
+        """Log and register the weights, unless a kill came between that and the note."""
+        marks = {_RECORD_TAG: self._id, _WEIGHTS_TAG: self.record.model_version}
+        version = self._registered_version(marks)
+        if version is None:
+            source, model = self._logged_model(marks) or self._log_model(marks)
+            version = self._register_version(source, model, marks)
+        self.client.set_registered_model_alias(self.record.model, ALIAS, version)
+
+    def _registered_version(self, marks: dict[str, str]) -> str | None:
+        found = self.client.search_model_versions(f"run_id='{self.sent['run']}'")
+        same = [each for each in found if each.name == self.record.model and marks.items() <= each.tags.items()]
+        return str(same[0].version) if same else None
+
+    def _logged_model(self, marks: dict[str, str]) -> tuple[str, str] | None:
+        experiment = _experiment(self.client, self.server)
+        found = self.client.search_logged_models([experiment], f"source_run_id = '{self.sent['run']}'")
+        same = [each for each in found if marks.items() <= each.tags.items()]
+        whole = [each for each in same if each.status == "READY"]
+        for part in same:
+            if part not in whole:
+                self.client.delete_logged_model(part.model_id)
+        return (f"models:/{whole[0].model_id}", whole[0].model_id) if whole else None
+
+    def _log_model(self, marks: dict[str, str]) -> tuple[str, str]:
+        import mlflow
+
+        from training.checkpoints.checkpoint import export_weights, require_checkpoint
+
+        checkpoint = require_checkpoint(self.folder, "result")
+        resolve_within(self.folder, os.path.relpath(checkpoint.path, self.folder))  # no other run's weights are sent
+        packages = [_ROOT / "training", _ROOT / "datagen"]
+        with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
+            export_weights(checkpoint, Path(temporary) / "weights")
+            with suppress(FileNotFoundError):  # what bodies it learned from, for training.inference.domain_check
+                about = read_within(self.folder, "provenance.json")
+                (Path(temporary) / "weights" / "provenance.json").write_bytes(about)
+            code = [str(shutil.copytree(p, Path(temporary) / p.name, ignore=_NO_CACHES)) for p in packages]
+            model = mlflow.pyfunc.log_model(
+                name="model",
+                python_model=str(_ROOT / "training" / "inference" / "registered_model.py"),
+                artifacts={"weights": str(Path(temporary) / "weights")},
+                code_paths=code,
+                signature=_signature(),
+                pip_requirements=["torch", "safetensors", "numpy", "scipy", "pydantic", "filelock", "zarr", "trimesh"],
+                tags=marks,
+            )
+        return model.model_uri, model.model_id
+
+    def _register_version(self, source: str, model: str, marks: dict[str, str]) -> str:
+        """As log_model's own registration, which prints into the progress bars."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            self.client.create_registered_model(self.record.model)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+        version = self.client.create_model_version(
+            self.record.model, source, self.sent["run"], tags=marks, model_id=model
+        )
+        return str(version.version)
+
+    def _send_status(self) -> None:
+        if self.record.status == "RUNNING":
+            self.client.update_run(self.sent["run"], status="RUNNING")
+        else:
+            ended = self.record.ended and max(
+                self.record.ended, self.record.started
+            )  # the clock may have been put back
+            self.client.set_terminated(self.sent["run"], self.record.status, ended)
+        self._note(status=self.record.status)
+
+    def _once(self, key: str, send: Any) -> None:
+        digest = hashlib.sha256(json.dumps(self.record.dataset).encode()).hexdigest()
+        value = digest if key != "model" else self.record.model_version
+        if self.sent.get(key) != value:
+            send()
+            self._note(**{key: value})
+
+    def _note(self, **changes: Any) -> None:
+        self.sent |= changes
+        note_sent(self.folder, self.server.uri, self.sent)
+
+
+@contextmanager
+def _quiet_run(run: str) -> Iterator[None]:
+    """The fluent API's run, without its advice on type hints and input examples (there is a signature)."""
+    import mlflow
+
+    with warnings.catch_warnings(), mlflow.start_run(run_id=run):
+        warnings.simplefilter("ignore")
+        yield
+
+
+_NO_CACHES = shutil.ignore_patterns("__pycache__", "*.pyc", "node_modules")
+
+
+def _key(name: str) -> str:
+    """A name of a metric, parameter or tag with what MLflow refuses in one replaced; folders may have given it."""
+    parts = re.sub(r"[^/\w.\- :]", "_", name)[:_LONGEST_NAME].split("/")
+    return "/".join(part for part in parts if part not in ("", ".", "..")) or "_"
+
+
+def _value(text: str) -> str:
+    return printable_lines(text)[:_LONGEST_PARAMETER]
+
+
+def _experiment(client: Any, server: Server) -> str:
+    found = client.get_experiment_by_name(EXPERIMENT)
+    if found is not None:
+        return str(found.experiment_id)
+    return str(client.create_experiment(EXPERIMENT, server.artifacts.as_uri() if server.artifacts else None))
+
+
+def _signature() -> Any:
+    import numpy as np
+    from mlflow.models import ModelSignature
+    from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
+
+    real, whole = np.dtype(np.float64), np.dtype(np.int64)
+    names = {"source": real, "target": real, "target_faces": whole}
+    inputs = Schema([TensorSpec(kind, (-1, 3), name) for name, kind in names.items()])
+    options = {"up": ("string", "Y"), "front": ("string", "Z"), "align": ("boolean", False), "refine": ("double", 0.0)}
+    params = ParamSchema([ParamSpec(name, *kind_and_default) for name, kind_and_default in options.items()])
+    return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]), params=params)
+
+
+class Mirror:
+    """Publishes in the background while a workflow runs; an outage is said once, and made up for later."""
+
+    def __init__(self, root: Path, server: Server, *, every: float = 5.0, after_failure: float = 30.0) -> None:
+        """``every``: seconds between publications, ``after_failure``: before the next one after an outage."""
+        self._root, self._server, self._every, self._after_failure = root, server, every, after_failure
+        self._stop = threading.Event()
+        self._failed: TrackingError | None = None
+        self._on = False
+        self._thread = threading.Thread(target=self._follow, name="mlflow-mirror", daemon=True)
+
+    def start(self) -> None:
+        """Begin, unless MLflow is not installed here: then records wait for a machine that has it."""
+        self._on = importlib.util.find_spec("mlflow") is not None
+        if self._on:
+            self._thread.start()
+        else:
+            log.warning("MLflow is not installed here, so nothing is sent. Later: %s", _how_to_sync(self._root, None))
+
+    def close(self) -> TrackingError | None:
+        """Stop, publish once more, and return what went wrong if that did not work."""
+        if not self._on:
+            return None
+        self._stop.set()
+        self._thread.join()
+        self._publish()
+        return self._failed
+
+    def _follow(self) -> None:
+        pause = 0.1
+        while not self._stop.wait(pause):
+            self._publish()
+            pause = self._every if self._failed is None else self._after_failure
+
+    def _publish(self) -> None:
+        try:
+            publish(self._root, self._server)
+            if self._failed is not None:
+                log.warning("MLflow at %s is back and has been sent what it missed", self._server.uri)
+            self._failed = None
+        except TrackingError as error:
+            if self._failed is None:
+                log.warning("%s", error)
+            self._failed = error

@@ -1,0 +1,225 @@
+"""MLflow's SQLite store beside a workflow: its URL, made whole or not at all, and valid where its folder was moved to.
+
+MLflow makes its tables in some dozens of migrations of which none can be taken back, and cannot finish what a kill cut
+short. So a store is made under another name and renamed. It also notes absolute places of artifacts; those are changed
+where the folder lies elsewhere by now.
+"""
+
+import logging
+import os
+import sqlite3
+import unicodedata
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import cache
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+from urllib.request import url2pathname
+
+from filelock import FileLock
+
+from datagen.common.errors import RecipeError, StorageError, UnsafeFileError
+from datagen.common.files import resolve_within
+from training.tracking.record import EXPERIMENT, Server
+
+log = logging.getLogger(__name__)
+_SCHEME = "sqlite:///"
+_SECONDS = 120.0  # to wait for another process that makes the same store
+_BUSY_SECONDS = 20.0  # to wait for another process that writes to it; MLflow waits as long
+_PLACES = {
+    "experiments": "artifact_location",
+    "runs": "artifact_uri",
+    "logged_models": "artifact_location",
+    "model_versions": "storage_location",
+}
+"""Table -> its column of absolute places."""
+
+
+def sqlite_server(database: Path, *, own: bool = False) -> Server:
+    """Return the server of a SQLite file, with its artifacts beside it.
+
+    Raises
+    ------
+    RecipeError
+        The path holds a character that cannot stand in the URL of such a store.
+    """
+    for character in str(database):
+        if character in "?%" or unicodedata.category(character) == "Cs":
+            raise RecipeError(
+                f"MLflow's store cannot lie at {str(database)!a}: {character!a} has another meaning in its "
+                "URL. Choose another folder, or name an MLflow server: --tracking-uri http://HOST:PORT"
+            )
+    return Server(f"{_SCHEME}{database}", artifacts=database.parent / "mlartifacts", own=own)
+
+
+def sqlite_file(uri: str) -> Path | None:
+    """Return the file of a SQLite store's URL; None for other servers."""
+    return Path(uri.removeprefix(_SCHEME)) if uri.startswith(_SCHEME) else None
+
+
+def prepare_store(server: Server) -> None:
+    """Make a SQLite store that is missing, replace one that was left unfinished, correct one that was moved.
+
+    Raises
+    ------
+    StorageError
+        The file is no database, or holds runs in tables that this MLflow does not use.
+    UnsafeFileError
+        The store is the folder's own, and it or its artifacts lead out of the folder.
+    """
+    database = sqlite_file(server.uri)
+    if database is None:
+        return
+    if server.own:
+        _refuse_links(database)
+    if not _is_whole(database):
+        database.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{database}.lock").acquire(timeout=_SECONDS):
+            if not _is_whole(database):
+                _set_aside(database)
+                _make(database)
+    if server.artifacts:
+        _correct_places(database, server.artifacts)
+    if server.own and server.artifacts:
+        _refuse_places_elsewhere(database, server.artifacts)
+
+
+def _is_whole(database: Path) -> bool:
+    """Whether MLflow's tables are all there.
+
+    Raises
+    ------
+    StorageError
+        The file is no database.
+    """
+    if not database.exists():
+        return False
+    with _opened(database) as connection:
+        return _revision(connection) == _newest_revision()
+
+
+def _set_aside(database: Path) -> None:
+    """Rename a store that is not whole and holds nothing.
+
+    Raises
+    ------
+    StorageError
+        It does hold something.
+    """
+    if not database.exists():
+        return
+    with _opened(database) as connection:
+        revision, count = _revision(connection), _count(connection, "runs") + _count(connection, "registered_models")
+    if count:
+        raise StorageError(
+            f"{database} holds {count} runs and models in tables of another MLflow (revision {revision or 'none'}, "
+            f"this one's is {_newest_revision()}). Copy the file, then: mlflow db upgrade {_SCHEME}{database}"
+        )
+    os.replace(database, f"{database}.unfinished")
+    log.warning("MLflow's store %s was left unfinished and holds no runs: made again", database)
+
+
+def _make(database: Path) -> None:
+    """Make the tables under another name, then rename."""
+    from mlflow.store.db.utils import _initialize_tables, create_sqlalchemy_engine
+
+    partial = database.with_name(f"{database.name}.partial")
+    for rest in (partial, partial.with_name(f"{partial.name}-journal")):
+        rest.unlink(missing_ok=True)
+    engine = create_sqlalchemy_engine(f"{_SCHEME}{partial}")
+    try:
+        _initialize_tables(engine)
+    finally:
+        engine.dispose()
+    os.replace(partial, database)
+
+
+def _correct_places(database: Path, artifacts: Path) -> None:
+    """Note where the artifacts are by now, if they lie beside the store and were noted elsewhere: it was moved."""
+    with _opened(database) as connection:
+        found = connection.execute("SELECT artifact_location FROM experiments WHERE name = ?", [EXPERIMENT]).fetchone()
+        there, here = found[0] if found else "", artifacts.as_uri()
+        if not there or there == here or not _holds_artifacts(connection, there, artifacts):
+            return
+        with connection:
+            for table, column in _PLACES.items():
+                connection.execute(
+                    f"UPDATE {table} SET {column} = :here || substr({column}, length(:there) + 1) "
+                    f"WHERE {column} = :there OR substr({column}, 1, length(:there) + 1) = :there || '/'",
+                    {"here": here, "there": there},
+                )
+    log.warning("MLflow's store %s was moved or copied: its artifacts are taken from %s", database, artifacts)
+
+
+@cache
+def _refuse_links(database: Path) -> None:
+    """Refuse, once a process, a store whose file or artifacts are links: MLflow would write through them."""
+    resolve_within(database.parent, database.name)
+    artifacts = resolve_within(database.parent, "mlartifacts")
+    for folder, folders, files in os.walk(artifacts):
+        link = next((name for name in (*folders, *files) if os.path.islink(os.path.join(folder, name))), None)
+        if link is not None:
+            raise UnsafeFileError(
+                f"{folder} holds a link, {link!r}, through which MLflow would write. If it is yours, name the store: "
+                f"--tracking-uri {_SCHEME}{database}"
+            )
+
+
+def _refuse_places_elsewhere(database: Path, artifacts: Path) -> None:
+    """Refuse a store that notes artifacts of our runs outside the folder ``artifacts``."""
+    root = Path(os.path.realpath(artifacts))
+    with _opened(database) as connection:
+        for (place,) in connection.execute(_OUR_PLACES, {"name": EXPERIMENT}):
+            local = url2pathname(urlsplit(place).path) if urlsplit(place).scheme == "file" else None
+            if local is None or not Path(os.path.realpath(local)).is_relative_to(root):
+                raise UnsafeFileError(
+                    f"{database} notes artifacts at {place!r}, outside its folder. If you put them there, name the "
+                    f"store: --tracking-uri {_SCHEME}{database}"
+                )
+
+
+_OUR_PLACES = """
+WITH ours AS (SELECT experiment_id FROM experiments WHERE name = :name)
+SELECT artifact_location FROM experiments WHERE name = :name
+UNION SELECT artifact_uri FROM runs WHERE experiment_id IN ours
+UNION SELECT artifact_location FROM logged_models WHERE experiment_id IN ours
+"""
+"""Wherever something of the project's experiment is written to."""
+
+
+def _holds_artifacts(connection: sqlite3.Connection, there: str, artifacts: Path) -> bool:
+    """Whether the artifacts of a run that are noted as being ``there`` lie in the folder ``artifacts``."""
+    begins = "SELECT run_uuid FROM runs WHERE substr(artifact_uri, 1, length(:there) + 1) = :there || '/'"
+    noted = connection.execute(begins, {"there": there})
+    return any((artifacts / run).is_dir() for (run,) in noted)
+
+
+@contextmanager
+def _opened(database: Path) -> Iterator[sqlite3.Connection]:
+    uri = f"file:{quote(str(database.absolute()))}?mode=rw"
+    try:
+        with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_SECONDS)) as connection:
+            yield connection
+    except sqlite3.OperationalError:  # locked, read-only, a broken disk: nothing is wrong with the file
+        raise
+    except sqlite3.DatabaseError as error:
+        raise StorageError(f"{database} is no MLflow store ({error}). Move it away, and a new one is made") from error
+
+
+def _revision(connection: sqlite3.Connection) -> str | None:
+    if not _count(connection, "alembic_version"):
+        return None
+    return str(connection.execute("SELECT version_num FROM alembic_version").fetchone()[0])
+
+
+def _count(connection: sqlite3.Connection, table: str) -> int:
+    """Rows of a table; none where there is no such table."""
+    known = connection.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", [table]).fetchone()
+    return int(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]) if known else 0
+
+
+@cache
+def _newest_revision() -> str:
+    from mlflow.store.db.utils import _get_latest_schema_revision
+
+    return str(_get_latest_schema_revision())

@@ -1,0 +1,1 @@
+"""Pictures of meshes; knows neither torch nor recipes."""

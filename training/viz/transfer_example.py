@@ -1,0 +1,188 @@
+"""One transfer by one method or several: what the figures and the viewer draw."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from datagen.common.arrays import Floats, Integers
+from training.viz.render.camera import Camera, MeshLike, azimuth_of, frame
+
+_REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One transfer; all meshes Y up, facing +Z, in one unit.
+
+    Parameters
+    ----------
+    title : str
+        Caption, for example ``"unseen pose 231, to identity 19"``.
+    source, target : mesh
+        Who gives the pose, and who gives the identity.
+    outputs : dict
+        Name of each method -> its mesh, with the vertices of the target in the same order.
+    truth : mesh or None
+        The right mesh, vertex by vertex, where it is known.
+    metrics : dict
+        Name of a method -> few words to stand under its picture, for example ``"PMD 12.3e-4"``.
+    """
+
+    title: str
+    source: MeshLike
+    target: MeshLike
+    outputs: Mapping[str, MeshLike]
+    truth: MeshLike | None = None
+    metrics: Mapping[str, str] = field(default_factory=dict)
+
+    def meshes(self) -> dict[str, MeshLike]:
+        """All meshes by name: ``source``, ``target``, ``output NAME`` for each method, ``truth`` if there is one."""
+        given = {"source": self.source, "target": self.target}
+        outputs = {output_of(name): mesh for name, mesh in self.outputs.items()}
+        return {**given, **outputs, **({} if self.truth is None else {"truth": self.truth})}
+
+
+@dataclass(frozen=True)
+class Solid:
+    """Vertices [v, 3] and triangles [f, 3]."""
+
+    vertices: Floats
+    faces: Integers
+
+
+@dataclass(frozen=True)
+class ErrorScale:
+    """How errors are told: `factor` turns the vertices' unit into `unit`; `limit` (in `unit`) ends the colours."""
+
+    unit: str = "cm"
+    factor: float = 100.0
+    limit: float | None = None
+
+    def of(self, comparison: Comparison) -> dict[str, Floats]:
+        """Return each method's errors [v] in `unit`; empty without a truth."""
+        return {name: self.factor * errors for name, errors in vertex_errors(comparison).items()}
+
+    def resolved(self, comparisons: Sequence[Comparison]) -> float:
+        """Return the limit in `unit`, by default the 99th percentile of a method's errors in all rows.
+
+        Of several methods it is the median of their percentiles: one bad method does not make all others look alike.
+        """
+        if self.limit is not None:
+            return self.limit
+        pooled: dict[str, list[Floats]] = {}
+        for comparison in comparisons:
+            for name, errors in self.of(comparison).items():
+                pooled.setdefault(name, []).append(errors)
+        tops = [float(np.percentile(np.concatenate(errors), 99)) for errors in pooled.values()]
+        return max(float(np.median(tops)), 1e-12) if tops else 1.0
+
+
+def output_of(method: str) -> str:
+    """Return the name of a method's mesh in :meth:`Comparison.meshes`."""
+    return f"output {method}"
+
+
+def methods_in(comparisons: Sequence[Comparison]) -> list[str]:
+    """Return the names of all methods, in the order in which they first come."""
+    return list(dict.fromkeys(name for one in comparisons for name in one.outputs))
+
+
+def vertex_errors(comparison: Comparison) -> dict[str, Floats]:
+    """Return each method's Euclidean distances [v], in their unit, of output vertices to the same of the truth.
+
+    Raises
+    ------
+    ValueError
+        If an output has not as many vertices as the truth.
+    """
+    if comparison.truth is None:
+        return {}
+    truth = np.asarray(comparison.truth.vertices, float)
+    found = {}
+    for name, mesh in comparison.outputs.items():
+        output = np.asarray(mesh.vertices, float)
+        if output.shape != truth.shape:
+            raise ValueError(
+                f"{comparison.title}: output {output.shape} of {name} and truth {truth.shape} differ in shape"
+            )
+        found[name] = np.linalg.norm(output - truth, axis=1)
+    return found
+
+
+def best_of(errors: Mapping[str, Floats]) -> str | None:
+    """Return the method with the least mean squared error, which is that with the least PMD; None for fewer than two.
+
+    PMD is this mean, in the truth's box and over three coordinates: one factor for all methods.
+    """
+    return min(errors, key=lambda name: float(np.square(errors[name]).mean())) if len(errors) > 1 else None
+
+
+def placed(comparison: Comparison) -> dict[str, Solid]:
+    """Return all meshes, named as in :meth:`Comparison.meshes`, set down on the ground at the origin.
+
+    Outputs are moved together with the truth, so that an offset between them is seen. The source only shows a pose:
+    it is drawn at the size (longest edge of the box) of the truth or, without one, of the first output.
+
+    Raises
+    ------
+    ValueError
+        If a vertex is not finite.
+    """
+    meshes = {
+        name: Solid(np.asarray(m.vertices, float), np.asarray(m.faces)) for name, m in comparison.meshes().items()
+    }
+    for name, mesh in meshes.items():
+        if bad := int((~np.isfinite(mesh.vertices).all(1)).sum()):
+            raise ValueError(f"{comparison.title}: {bad} of {len(mesh.vertices)} vertices of the {name} are not finite")
+    right = meshes.get("truth") or next((m for name, m in meshes.items() if name.startswith("output ")), None)
+    return {
+        name: Solid(_stood(mesh, name, right, moves_with=meshes.get("truth")), mesh.faces)
+        for name, mesh in meshes.items()
+    }
+
+
+def _stood(mesh: Solid, name: str, right: Solid | None, *, moves_with: Solid | None) -> Floats:
+    anchor = moves_with if moves_with is not None and name.startswith("output ") else mesh
+    scale = 1.0
+    if name == "source" and right is not None:
+        scale = _size(right.vertices) / max(_size(mesh.vertices), 1e-12)
+    return scale * (mesh.vertices - standing_point(anchor.vertices))
+
+
+def standing_point(vertices: Floats) -> Floats:
+    """Return the point [3] under the middle of the box of vertices [v, 3]."""
+    low, high = vertices.min(0), vertices.max(0)
+    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+
+
+def _size(vertices: Floats) -> float:
+    return float(np.ptp(vertices, axis=0).max())
+
+
+def camera_of(meshes: Mapping[str, Solid], size: tuple[int, int] = (320, 400)) -> Camera:
+    """Return the camera that holds the placed meshes of a comparison in a panel of `size` pixels.
+
+    The side it looks from suits source, target and truth, whatever the outputs look like.
+    """
+    known = [mesh for name, mesh in meshes.items() if not name.startswith("output ")]
+    return frame(_to_hold(meshes), size=size, azimuth=azimuth_of(known), margin=0.055)
+
+
+def in_view(meshes: Mapping[str, Solid]) -> tuple[Floats, Floats, Floats]:
+    """Return the axes [3, 3] of that camera as rows, and the least and largest coordinates [3] along them."""
+    axes = camera_of(meshes).axes()
+    points = np.concatenate([mesh.vertices for mesh in _to_hold(meshes)]) @ axes.T
+    return axes, points.min(0), points.max(0)
+
+
+def _to_hold(meshes: Mapping[str, Solid]) -> list[Solid]:
+    """Return what a picture must hold: an output that strays far from the truth does not shrink all the others."""
+    known = [mesh for name, mesh in meshes.items() if not name.startswith("output ")]
+    if "truth" not in meshes:
+        return list(meshes.values())
+    points = np.concatenate([mesh.vertices for mesh in known])
+    low, high = points.min(0), points.max(0)
+    reach = _REACH * (high - low)
+    outputs = [mesh for name, mesh in meshes.items() if name.startswith("output ")]
+    return known + [Solid(np.clip(mesh.vertices, low - reach, high + reach), mesh.faces) for mesh in outputs]

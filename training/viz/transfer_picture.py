@@ -1,0 +1,37 @@
+"""What a person looks at after a transfer: source, target and output side by side, as a picture and as a page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.common.arrays import Floats, Integers
+from training.viz.comparison_figure import comparison_figure
+from training.viz.transfer_example import Comparison
+from training.viz.viewer import write_viewer
+
+PANEL = (480, 560)
+
+
+@dataclass(frozen=True)
+class NamedMesh:
+    """Vertices [v, 3], Y up and facing +Z, triangles [f, 3], and what the page calls them."""
+
+    vertices: Floats
+    faces: Integers
+    name: str
+
+
+def shown(source: NamedMesh, target: NamedMesh, output: NamedMesh) -> Comparison:
+    """One transfer without a known truth, as figures and viewer take it."""
+    title = f"{target.name} in the pose of {source.name}"
+    return Comparison(title=title, source=source, target=target, outputs={"Output": output})
+
+
+def write_picture(rows: Sequence[Comparison], path: Path) -> Path:
+    """Draw transfers as a PNG, one a row; it appears whole or not at all."""
+    return comparison_figure(rows, path, panel=PANEL)
+
+
+def write_page(rows: Sequence[Comparison], path: Path) -> Path:
+    """Write a page (HTML) in which transfers can be turned; it appears whole or not at all."""
+    return write_viewer(rows, path, title="Pose transfer")

@@ -1,0 +1,199 @@
+"""An interactive page of transfers, by one method or several: one HTML file that needs neither network nor server.
+
+What is embedded, little-endian in base64: positions as uint16 between the corners of each mesh's box (off by at most
+half a step, ``box / 65535 / 2``: 15 micrometres for a body of 2 m), triangles as uint16 or uint32 and once for all
+meshes that share them, errors as uint16 levels of the largest. The drawing code is assets/viewer.js, bundled with
+three.js.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import os
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from datagen.common.arrays import Floats, Integers
+from datagen.common.files import write_atomically
+from datagen.common.printable import printable
+from training.viz.render.lighting import ground_shadow, openness
+from training.viz.style import ERROR_COLORS, ROLE_COLORS, method_colors
+from training.viz.transfer_example import Comparison, ErrorScale, Solid, best_of, in_view, methods_in, output_of, placed
+
+_LEVELS = 65535
+_GROUND_EVERY = 2  # the page keeps every second cell of the ground's shadow
+
+
+def write_viewer(
+    examples: Sequence[Comparison],
+    path: str | os.PathLike[str],
+    *,
+    title: str,
+    error_scale: ErrorScale | None = None,
+) -> Path:
+    """Write a page with source, target, outputs, ground truth and errors of every example, to be turned with the mouse.
+
+    All panels of the page turn together. Of several methods each can be hidden. Without a truth there are no errors.
+    The page works from a file, from a server, and inside a frame; it loads nothing. Names and titles are shown as
+    plain text.
+
+    Parameters
+    ----------
+    examples : sequence of Comparison
+        A mesh's ``name`` attribute, where it has one, is shown under its panel; under an output, its metrics.
+    path : path of the HTML to write
+    title : str
+        Heading of the page.
+    error_scale : ErrorScale, optional
+        Unit of the errors; by default centimetres for vertices in metres.
+
+    Returns
+    -------
+    Path
+        The path of the page.
+
+    Raises
+    ------
+    ValueError
+        If there is no example, a vertex is not finite, or an output and its truth differ in shape.
+    """
+    if not examples:
+        raise ValueError("write_viewer needs at least one example")
+    payload = viewer_payload(examples, error_scale=error_scale or ErrorScale())
+    licence = f"/*\n{_asset('THREE-LICENSE.txt')}*/\n"  # a page is a copy of three.js, so its licence goes along
+    page = Template(_asset("viewer.html")).substitute(
+        title=html.escape(printable(title)),
+        style=_asset("viewer.css"),
+        data=_inert_json(_printable(payload)),
+        bundle=licence + _asset("viewer.bundle.js"),
+    )
+    write_atomically(Path(path), page.encode())
+    return Path(path)
+
+
+def viewer_payload(examples: Sequence[Comparison], *, error_scale: ErrorScale) -> dict[str, Any]:
+    """Return what the page is given: meshes standing on the ground, errors, colours and the first views."""
+    triangles: dict[str, dict[str, str]] = {}
+    methods = methods_in(examples)
+    return {
+        "examples": [_example(example, error_scale, triangles) for example in examples],
+        "methods": [{"name": name, "color": color} for name, color in method_colors(methods).items()],
+        "faces": triangles,
+        "colors": dict(ROLE_COLORS),
+        "error": {
+            "unit": error_scale.unit,
+            "limit": error_scale.resolved(examples),
+            "colors": np.rint(255 * ERROR_COLORS).astype(int).tolist(),
+        },
+    }
+
+
+def decode_positions(mesh: dict[str, Any]) -> Floats:
+    """Return the positions [v, 3] of an embedded mesh, as the page sees them."""
+    levels = np.frombuffer(base64.b64decode(mesh["positions"]), "<u2").reshape(-1, 3)
+    return np.asarray(np.array(mesh["low"]) + levels * np.array(mesh["step"]))
+
+
+def _example(comparison: Comparison, scale: ErrorScale, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+    meshes, errors = placed(comparison), scale.of(comparison)
+    originals = comparison.meshes()
+    embedded = {
+        name: _mesh(mesh, str(getattr(originals[name], "name", "")), triangles) for name, mesh in meshes.items()
+    }
+    return {
+        "title": comparison.title,
+        "source": embedded["source"],
+        "target": embedded["target"],
+        "truth": embedded.get("truth"),
+        "outputs": {name: embedded[output_of(name)] for name in comparison.outputs},
+        "metrics": {name: comparison.metrics.get(name, "") for name in comparison.outputs},
+        "errors": {name: _errors(values, scale.unit) for name, values in errors.items()},
+        "best": best_of(errors),
+        "view": _view(meshes),
+    }
+
+
+def _errors(errors: Floats, unit: str) -> dict[str, Any]:
+    """Return a method's errors [v], and their mean and maximum in words."""
+    largest = float(errors.max())
+    step = max(largest, 1e-12) / _LEVELS
+    return {
+        "levels": _base64(np.rint(errors / step).astype("<u2")),
+        "step": step,
+        "mean": float(errors.mean()),
+        "text": f"mean {errors.mean():.3g}, max {largest:.3g} {unit}",
+    }
+
+
+def _mesh(mesh: Solid, name: str, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+    vertices, faces = mesh.vertices, np.asarray(mesh.faces, np.int64)
+    low = vertices.min(0)
+    step = np.maximum(np.ptp(vertices, axis=0), 1e-12) / _LEVELS
+    shadow, corner, side = ground_shadow(vertices, faces)
+    return {
+        "name": name,
+        "positions": _base64(np.rint((vertices - low) / step).astype("<u2")),
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "faces": _shared_faces(faces, len(vertices), triangles),
+        "openness": _base64(np.rint(255 * np.clip(openness(vertices, faces), 0, 1)).astype(np.uint8)),
+        "ground": {
+            "shadow": _base64(np.rint(255 * shadow[::_GROUND_EVERY, ::_GROUND_EVERY]).astype(np.uint8)),
+            "corner": corner.tolist(),
+            "side": side,
+        },
+    }
+
+
+def _shared_faces(faces: Integers, vertex_count: int, triangles: dict[str, dict[str, str]]) -> str:
+    """Keep triangles once, and return the key they are found under."""
+    kind, code = ("uint16", "<u2") if vertex_count <= _LEVELS else ("uint32", "<u4")
+    indices = faces.astype(code)
+    key = hashlib.sha256(indices.tobytes()).hexdigest()[:16] + kind
+    triangles.setdefault(key, {"kind": kind, "indices": _base64(indices)})
+    return key
+
+
+def _view(meshes: dict[str, Solid]) -> dict[str, Any]:
+    """Return an example's first view, that of the pictures: its direction, and the extent to hold."""
+    axes, low, high = in_view(meshes)
+    extent = high - low
+    return {
+        "direction": axes[2].tolist(),
+        "center": ((low + high) / 2 @ axes).tolist(),
+        "width": float(extent[0]),
+        "height": float(extent[1]),
+        "depth": float(extent[2]),
+    }
+
+
+def _base64(array: npt.NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def _printable(value: Any) -> Any:
+    """Return a payload whose texts, names among the keys too, can be shown."""
+    if isinstance(value, dict):
+        return {printable(key): _printable(its) for key, its in value.items()}
+    if isinstance(value, list):
+        return [_printable(its) for its in value]
+    return printable(value) if isinstance(value, str) else value
+
+
+def _inert_json(payload: Any) -> str:
+    """Return JSON that cannot end the script element it stands in, nor open a comment there."""
+    text = json.dumps(payload, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+@cache
+def _asset(name: str) -> str:
+    return (files("training.viz") / "assets" / name).read_text(encoding="utf-8")

@@ -1,0 +1,303 @@
+"""The subcommands of ``dsffnet`` that make, show, check, take in and give out data."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, get_args
+
+from datagen.bodies.imported_layouts import Layout
+from datagen.bodies.standins.smpl_format import Kind
+from datagen.common.errors import DatasetError, RecipeError
+from datagen.common.printable import printable
+from datagen.exporters import ExportLayout
+from datagen.recipe import PATH_KEYS, AnnyTopology, DatasetRecipe
+from workflows.cli.declare import Command, add_command
+from workflows.pipeline.console import (
+    add_local_option,
+    add_recipe_options,
+    add_set_option,
+    add_yes_option,
+    print_facts,
+    print_text,
+)
+from workflows.recipe.loader import change_recipe, load_recipe, override_values, recipe_faults, with_absolute_paths
+
+
+def declare_generate(made: argparse.ArgumentParser) -> None:
+    add_recipe_options(made)
+    _add_making(made)
+    made.add_argument("--fresh", action="store_true", help="remove what is there first")
+
+
+def declare_append(made: argparse.ArgumentParser) -> None:
+    made.add_argument("out", metavar="X.zarr", help="a complete dataset")
+    for name, what in (
+        ("training", "training identities"),
+        ("evaluation", "evaluation identities"),
+        ("seen", "poses that occur in training"),
+        ("unseen", "poses kept for evaluation"),
+    ):
+        made.add_argument(f"--{name}", type=int, metavar="TOTAL", help=f"{what}, with those that are there")
+    add_local_option(made)
+    add_yes_option(made)
+    add_set_option(made)
+
+
+def declare_inspect(made: argparse.ArgumentParser) -> None:
+    made.add_argument("dataset", metavar="X.zarr")
+    made.add_argument("--picture", metavar="PNG", help="where the picture goes; none: no picture")
+
+
+def declare_verify(made: argparse.ArgumentParser) -> None:
+    made.add_argument("dataset", metavar="X.zarr")
+    made.add_argument("--repair", action="store_true", help="make faulty or missing shards again")
+    add_set_option(made)
+
+
+def declare_import(made: argparse.ArgumentParser) -> None:
+    made.add_argument("layout", choices=get_args(Layout), help="how the files lie (docs/importing.md)")
+    made.add_argument("folder", metavar="FOLDER", help="where they are")
+    _add_making(made)
+    made.add_argument("--fresh", action="store_true", help="remove what is there first")
+    add_set_option(made)
+
+
+def declare_export(made: argparse.ArgumentParser) -> None:
+    made.add_argument("dataset", metavar="X.zarr")
+    made.add_argument("--layout", choices=get_args(ExportLayout), required=True, help="see docs/importing.md")
+    made.add_argument("--out", required=True, metavar="FOLDER", help="where the files go")
+    made.add_argument("--identities", type=int, nargs="+", metavar="I", help="these only")
+    made.add_argument("--poses", type=int, nargs="+", metavar="P", help="these only")
+    made.add_argument("--prefix", default="", help="before the numbers in npt-*: id or toy_ for 3D-CoreNet's loaders")
+    made.add_argument("--fresh", action="store_true", help="write files anew that are there")
+
+
+def declare_convert(made: argparse.ArgumentParser) -> None:
+    made.add_argument("model", metavar="MODEL", help="the file that came with your licence (.pkl or .npz)")
+    made.add_argument("--out", required=True, metavar="X.npz", help="where the arrays go")
+
+
+def declare_stand_in(made: argparse.ArgumentParser) -> None:
+    made.add_argument("kind", choices=get_args(Kind), help="whose layout")
+    made.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
+    made.add_argument(
+        "--topology",
+        default="notoes_collapse10pc",
+        choices=get_args(AnnyTopology),
+        help="of the Anny body it is made from",
+    )
+
+
+def _add_making(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", required=True, metavar="X.zarr", help="where the dataset goes (folder or store URL)")
+    add_local_option(parser)
+    add_yes_option(parser)
+
+
+def generate_command(options: argparse.Namespace) -> None:
+    """Make a dataset, or what is missing of one."""
+    from datagen.generate import generate
+
+    recipe = load_recipe(options.recipe, options.set).data
+    with _runner(options, recipe, anew=options.fresh) as how:
+        generate(recipe, options.out, fresh=options.fresh, **how)
+    _show(options.out)
+
+
+def append_command(options: argparse.Namespace) -> None:
+    """Give a dataset more identities or poses, up to these totals; nothing that is there is touched."""
+    from datagen.generate import append, grown_recipe
+
+    totals = {name: getattr(options, name) for name in ("training", "evaluation", "seen", "unseen")}
+    if not any(total is not None for total in totals.values()):
+        raise RecipeError("nothing to append: name at least one of --training, --evaluation, --seen, --unseen")
+    recipe = _own_recipe(options.out, options.set)
+    grown = grown_recipe(options.out, recipe, totals)
+    with _runner(options, grown, anew=grown != recipe) as how:
+        append(options.out, **totals, recipe=recipe, **how)
+    _show(options.out)
+
+
+def inspect_command(options: argparse.Namespace) -> None:
+    """Show what a dataset holds, at any status, and draw identities x poses."""
+    from datagen.store import open_dataset
+    from datagen.store.verify import describe
+    from workflows.pipeline.stage_functions import draw_contact_sheet, is_complete
+
+    print_facts(describe(options.dataset))
+    if options.picture != "none" and is_complete(options.dataset):
+        default = f"{Path(options.dataset).name.removesuffix('.zarr')}-contact-sheet.png"
+        path = draw_contact_sheet(open_dataset(options.dataset), Path(options.picture or default))
+        print_text(f"picture: {path}")
+
+
+def verify_command(options: argparse.Namespace) -> None:
+    """Check every shard; with --repair, make the faulty ones again."""
+    from datagen.generate import inline, repair
+    from datagen.grid import Grid
+    from datagen.store.verify import find_faults
+    from workflows.pipeline.progress import bar
+    from workflows.pipeline.stage_functions import generation_bar, is_complete
+
+    recipe = _own_recipe(options.dataset, options.set)
+    count = Grid(recipe).shard_count
+    faults = list(
+        find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
+    )
+    for fault in faults:
+        print_text(printable(f"fault: {fault.path}: {fault.reason}"))
+    complete = is_complete(options.dataset)
+    if not faults and complete:
+        print_text(f"{options.dataset} is whole")
+        return
+    if not options.repair:
+        found = f"has {len(faults)} faults" if faults else "is not complete"
+        raise DatasetError(f"{options.dataset} {found}. Mend it: dsffnet verify {options.dataset} --repair")
+    repair(options.dataset, recipe, faults, run=inline, progress=generation_bar)
+    print_text(f"{options.dataset} is whole again")
+
+
+def _own_recipe(url: str, overrides: Sequence[str]) -> DatasetRecipe:
+    """The recipe stored with a dataset, with other paths of asset files.
+
+    Raises
+    ------
+    RecipeError
+        Something else than a path is changed.
+    """
+    from datagen.store.verify import require_recipe
+
+    stored = require_recipe(url)
+    recipe = change_recipe({"data": stored.model_dump(mode="json")}, overrides, where=url).data
+    if recipe.sha256() != stored.sha256():
+        raise RecipeError(f"--set can only change where the asset files of {url} lie: {', '.join(sorted(PATH_KEYS))}")
+    return recipe
+
+
+def import_command(options: argparse.Namespace) -> None:
+    """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset."""
+    from datagen.generate import generate
+    from datagen.importers import found_recipe
+
+    of_body = _body_options(options.set)
+    with recipe_faults(f"import {options.layout}"):
+        found = found_recipe(options.layout, options.folder, **of_body)
+    base = {"data": found.model_dump(mode="json")}
+    recipe = change_recipe(base, options.set, where=f"import {options.layout}").data
+    with _runner(options, recipe, anew=options.fresh) as how:
+        generate(recipe, options.out, fresh=options.fresh, **how)
+    _show(options.out)
+
+
+def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
+    """What ``--set data.body.*`` says: it decides which files are found."""
+    section: Any = override_values(overrides)
+    for name in ("data", "body"):
+        section = section.get(name, {})
+        if not isinstance(section, dict):
+            raise RecipeError(f"--set {name}={section} is a whole section; set its keys, e.g. --set data.body.up=z")
+    for fixed in section.keys() & {"family", "layout", "path"}:
+        raise RecipeError(f"--set data.body.{fixed} is said by the command itself: dsffnet import LAYOUT FOLDER")
+    return dict(with_absolute_paths(section, Path.cwd()))
+
+
+def export_command(options: argparse.Namespace) -> None:
+    """Write a dataset's meshes as files: NPT's layout for peers' code, or GLB, OBJ, PLY for people."""
+    from datagen.exporters import export_dataset
+    from datagen.store import open_dataset
+    from workflows.pipeline.progress import bar
+
+    written = export_dataset(
+        open_dataset(options.dataset),
+        options.out,
+        layout=options.layout,
+        identities=options.identities,
+        poses=options.poses,
+        prefix=options.prefix,
+        fresh=options.fresh,
+        progress=lambda cells: bar(cells, total=len(cells), what="export", unit="mesh"),
+    )
+    print_text(f"{options.out}: {written} files written")
+
+
+def convert_body_command(options: argparse.Namespace) -> None:
+    """Write an original SMPL or SMAL file (a pickle) as plain arrays; nothing in it is executed."""
+    from datagen.bodies.smpl_family.model_file import convert_model
+
+    print_text(f"written: {convert_model(Path(options.model), Path(options.out))}")
+
+
+def stand_in_command(options: argparse.Namespace) -> None:
+    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, to try things out."""
+    from datagen.bodies.standins.smpl_format import write_standin
+
+    path = write_standin(options.kind, Path(options.out), topology=options.topology)
+    family = "smal" if options.kind == "smal" else f"smpl data.body.model={options.kind}"
+    print_text(
+        f"written: {path}. It is not the licensed model. Use it: --set data.body.family={family} data.body.path={path}"
+    )
+
+
+@contextmanager
+def _runner(options: argparse.Namespace, recipe: DatasetRecipe, *, anew: bool) -> Iterator[dict[str, Any]]:
+    """Where tasks run (here or on Ray, by their size) and what shows their progress, once there is room for all."""
+    from workflows.pipeline.data_size import announce_size
+    from workflows.pipeline.ray_cluster import require_reachable
+    from workflows.pipeline.stage_functions import generation_bar
+    from workflows.pipeline.tasks import TaskRunner
+
+    options.out = require_reachable(options.out, option="--out", urls=True)
+    announce_size(recipe, options.out, anew=anew, yes=options.yes, local=options.local)
+    with TaskRunner(local=options.local) as tasks:
+        yield {"run": tasks.make_shards, "progress": generation_bar}
+
+
+def _show(url: str) -> None:
+    from datagen.store.verify import describe
+
+    print_facts(describe(url))
+
+
+_EXAMPLES: dict[Command, str] = {
+    generate_command: """\
+  dsffnet generate --recipe quickstart --out data/quickstart.zarr
+  dsffnet generate --recipe quickstart --set data.identities.seed=7 --out data/custom.zarr
+  dsffnet generate --recipe data/custom.zarr --out data/custom-again.zarr""",
+    append_command: """\
+  dsffnet append data/quickstart.zarr --training 24
+  dsffnet append data/quickstart.zarr --evaluation 12 --unseen 400""",
+    inspect_command: """\
+  dsffnet inspect data/quickstart.zarr
+  dsffnet inspect data/quickstart.zarr --picture sheet.png""",
+    import_command: """\
+  dsffnet import faust FAUST/training/registrations --out data/faust.zarr
+  dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
+    convert_body_command: """\
+  dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz""",
+    stand_in_command: """\
+  dsffnet stand-in smpl --out standin.npz
+  dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr""",
+    export_command: """\
+  dsffnet export data/quickstart.zarr --layout npt-obj --out exported
+  dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
+    verify_command: """\
+  dsffnet verify data/quickstart.zarr
+  dsffnet verify data/quickstart.zarr --repair""",
+}
+
+
+def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare them all."""
+
+    def declared(command: Command, **options: bool) -> argparse.ArgumentParser:
+        return add_command(commands, command, _EXAMPLES[command], **options)
+
+    declare_generate(declared(generate_command, takes_recipe=True))
+    declare_append(declared(append_command))
+    declare_inspect(declared(inspect_command))
+    declare_verify(declared(verify_command))
+    declare_import(declared(import_command))
+    declare_export(declared(export_command))
+    declare_convert(declared(convert_body_command))
+    declare_stand_in(declared(stand_in_command))

@@ -1,0 +1,120 @@
+"""``dsffnet transfer``: pose a mesh, or a sequence of meshes, like another."""
+
+import argparse
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from datagen.common.errors import RecipeError
+from datagen.common.printable import printable
+from datagen.common.resources import memory_errors
+from workflows.cli.declare import add_command
+from workflows.pipeline.console import print_text
+from workflows.pipeline.weights_argument import evaluated, which_checkpoint
+
+_EXAMPLES = """\
+  dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
+  dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
+  dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
+  dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine"""
+_OWN_STORE = Path("runs/quickstart/mlflow.db")
+
+
+def add_transfer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare the command and its options."""
+    made = add_command(commands, transfer_command, _EXAMPLES)
+    made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
+    made.add_argument(
+        "--model", required=True, metavar="RUN", help="run folder, weights, or models:/NAME@ALIAS (MLflow)"
+    )
+    made.add_argument(
+        "--checkpoint",
+        type=which_checkpoint,
+        default="result",
+        metavar="result|latest|best|STEP",
+        help="which of the run's weights (result: the best where early stopping ended the run, else the latest)",
+    )
+    made.add_argument(
+        "--source", metavar="A", help="mesh in the wanted pose, or a folder or pattern (w*.obj) of frames"
+    )
+    made.add_argument("--target", metavar="B", help="mesh of the wanted identity")
+    made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
+    made.add_argument("--source-geometry", metavar="NAME", help="which of several geometries of a GLB has the pose")
+    made.add_argument("--target-geometry", metavar="NAME", help="which of several geometries of a GLB is posed")
+    _add_standing(made)
+    _add_extras(made)
+    made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
+
+
+def _add_standing(made: argparse.ArgumentParser) -> None:
+    made.add_argument("--align", action="store_true", help="find by the network how each mesh stands, and turn it")
+    made.add_argument("--up", metavar="AXIS", help="towards the head: X Y Z -X -Y -Z (Y), or two: SOURCE,TARGET")
+    made.add_argument("--front", metavar="AXIS", help="where the body faces (Z), or two: SOURCE,TARGET")
+
+
+def _add_extras(made: argparse.ArgumentParser) -> None:
+    made.add_argument(
+        "--refine", action="store_true", help="pull the edges back to the target's (see docs/transfer.md)"
+    )
+    made.add_argument("--smooth", default="0", metavar="N|0.2s", help="smooth a sequence over N frames or a time (off)")
+    made.add_argument("--fps", type=_rate, default=30.0, metavar="N", help="frames a second of a sequence (30)")
+    made.add_argument("--picture", action="store_true", help="write a PNG of source, target and output beside C")
+    made.add_argument("--viewer", action="store_true", help="write a page to turn them in (HTML) beside C")
+
+
+def transfer_command(options: argparse.Namespace) -> None:
+    """Pose one mesh like another, or like each of a sequence."""
+    from workflows.transfer.job import TransferJob
+
+    job = TransferJob.from_options(options)
+    job.check_places()
+    source, target = job.read_source(0), job.read_target()
+    job.check_textures(source, target)
+    with weights_of(options) as weights:
+        from training.inference.transfer import PoseTransfer
+        from workflows.transfer.run import TransferWork
+
+        work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
+        with memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"):
+            work.settle_axes(weights)
+            print_text(printable(work.run()))
+
+
+@contextmanager
+def weights_of(options: argparse.Namespace) -> Iterator[Path]:
+    """The folder or file of the weights that ``--model`` names.
+
+    Raises
+    ------
+    CheckpointError
+        There are none, or they are damaged.
+    RegistryError
+        MLflow does not have that model.
+    """
+    if not options.model.startswith("models:/"):
+        yield evaluated(Path(options.model), options.checkpoint).weights
+        return
+    from training.inference.registered_model import download_weights
+
+    with tempfile.TemporaryDirectory(prefix="dsffnet-") as folder:
+        yield download_weights(options.model, _tracking_uri(options.tracking_uri), Path(folder))
+
+
+def _tracking_uri(asked: str | None) -> str:
+    """The server of registered models: as asked, as the environment says, or the quickstart's own store."""
+    from training.tracking.mlflow_store import sqlite_server
+
+    own = sqlite_server(_OWN_STORE.absolute()).uri if _OWN_STORE.is_file() else ""
+    uri = asked or os.environ.get("MLFLOW_TRACKING_URI") or own
+    if not uri:
+        raise RecipeError("models:/ needs an MLflow server: add --tracking-uri URI, or set MLFLOW_TRACKING_URI")
+    return uri
+
+
+def _rate(word: str) -> float:
+    value = float(word)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{word!r} is not a number above 0")
+    return value

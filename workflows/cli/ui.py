@@ -1,0 +1,96 @@
+"""``dsffnet ui``: MLflow's page of a folder. Its server is several processes; they end with this one, come what may."""
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from datagen.common.errors import DatasetError, DsffnetError
+from training.tracking.mlflow_store import prepare_store, sqlite_server
+from workflows.cli.declare import add_command
+
+_LOOK_SECONDS = 0.3
+
+
+class PageError(DsffnetError):
+    """MLflow's page cannot be shown."""
+
+
+def ui_command(options: argparse.Namespace) -> None:
+    """Show a folder's MLflow store in the browser, until Ctrl-C or the end of the shell or make that started this."""
+    database = Path(options.out).absolute() / "mlflow.db"
+    if not database.is_file():
+        raise DatasetError(
+            f"{database} is not there yet: python workflows/full.py makes it; for another folder: dsffnet ui FOLDER"
+        )
+    _require_free(options.port)
+    print(f"MLflow: http://127.0.0.1:{options.port}   (ready in some seconds; Ctrl-C ends it)", flush=True)
+    status = _serve(_server(database, options.port), ended=_parent_is_gone())
+    if status:
+        raise PageError(f"MLflow's server ended with status {status}; its words are above")
+
+
+def _server(database: Path, port: int) -> list[str]:
+    server = sqlite_server(database, own=True)
+    prepare_store(server)
+    return [
+        *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
+        *("--backend-store-uri", server.uri, "--artifacts-destination", str(server.artifacts)),
+    ]
+
+
+def _require_free(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise PageError(
+                f"port {port} of 127.0.0.1 cannot be used ({error.strerror}). Another: dsffnet ui --port {port + 1}, "
+                f"or make ui UI_PORT={port + 1}"
+            ) from error
+
+
+def _parent_is_gone() -> Callable[[], bool]:
+    """Whether the shell or make that started this has died; one that is killed cannot tell."""
+    parent = os.getppid()
+    return lambda: os.getppid() != parent
+
+
+def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
+    """Run a server until it ends by itself (its status), or ``ended`` says so (0); a signal ends it too."""
+    signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # a closed terminal, of nohup too
+    quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes fewer
+    keeper = subprocess.Popen(
+        [sys.executable, "-m", "workflows.cli.keeper", *command],
+        stdin=subprocess.PIPE,
+        start_new_session=True,
+        env=os.environ | quiet,
+    )
+    assert keeper.stdin is not None
+    try:
+        while keeper.poll() is None and not ended():
+            time.sleep(_LOOK_SECONDS)
+        return keeper.poll() or 0
+    finally:
+        keeper.stdin.close()
+        keeper.wait()
+
+
+_EXAMPLES = """\
+  dsffnet ui
+  dsffnet ui runs/custom --port 5001"""
+
+
+def add_ui(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Declare it and its options."""
+    made = add_command(commands, ui_command, _EXAMPLES)
+    made.add_argument(
+        "out", nargs="?", default="runs/quickstart", metavar="FOLDER", help="of a workflow (default: %(default)s)"
+    )
+    made.add_argument("--port", type=int, default=5000, help="of 127.0.0.1 (default: %(default)s)")

@@ -1,0 +1,1 @@
+"""The paper's comparison and ablation: plan, run, report."""

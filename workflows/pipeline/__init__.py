@@ -1,0 +1,1 @@
+"""Stages of a workflow, and what they run on."""

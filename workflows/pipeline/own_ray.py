@@ -1,0 +1,231 @@
+"""A Ray of our own on this machine: started with patience, watched while it works, ended with everything it started."""
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from datagen.common.errors import ClusterError
+from training.tracking.threads import background
+
+_ROOT = Path(__file__).resolve().parents[2]
+_PACKAGE = f"-packages{os.sep}ray{os.sep}"  # where Ray's own programs lie, in any environment
+_OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
+_START_SECONDS = (30.0, 150.0)  # Ray's own patience with its node, and ours after that
+_SERVERS = ("gcs_server", "raylet")
+_LOOK_SECONDS, _LEAVE_SECONDS = 0.5, 20.0
+WITHOUT_RAY = "--local, where the command has it (dsffnet train: --set training.launcher=inline training.ranks=1)"
+
+
+def _start() -> None:
+    """Start Ray here; where that fails, as on a busy machine, once more and with more patience.
+
+    Raises
+    ------
+    ClusterError
+        It failed twice.
+    """
+    for seconds in _START_SECONDS:
+        try:
+            with _patience(seconds):
+                _init()
+            return
+        except Exception as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            _end_processes()
+            if seconds != _START_SECONDS[-1]:
+                print(f"Ray did not start ({reason}); once more, with more time", file=sys.stderr, flush=True)
+    raise ClusterError(
+        f"Ray did not start on this machine, tried twice ({reason}). If the machine is busy, run the same command "
+        f"again later; or work in this process, without Ray: {WITHOUT_RAY}"
+    )
+
+
+def _init() -> None:
+    import ray
+
+    with sigterm_kept():
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            object_store_memory=_OBJECT_STORE,
+            logging_level=logging.ERROR,
+            log_to_driver=False,  # errors of tasks and ranks reach the driver anyway; logs: /tmp/ray/session_latest
+            runtime_env={"env_vars": {"PYTHONPATH": f"{_ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}},
+        )
+
+
+@contextmanager
+def sigterm_kept() -> Iterator[None]:
+    """Have SIGTERM keep its meaning while Ray connects and after: ``ray.init`` has the signal end the process without
+    a word, and Ray's C++ part puts a handler before that one which prints where the process stood.
+    """
+    from ray._private import utils
+
+    set_handler, before = utils.set_sigterm_handler, signal.getsignal(signal.SIGTERM)
+    utils.set_sigterm_handler = lambda _: None
+    try:
+        yield
+    finally:
+        utils.set_sigterm_handler = set_handler
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _patience(seconds: float) -> Iterator[None]:
+    """Have Ray wait so long for its store (a setting), and for its node: the latter's 30 s are a constant of its code,
+    which asks ``get_node`` until that answers.
+    """
+    from ray._private import services
+
+    os.environ["RAY_gcs_server_port_wait_time_s"] = f"{seconds:.0f}"  # noqa: SIM112  (the name that Ray reads)
+
+    ask: Callable[..., Any] = services.get_node
+    until = time.monotonic() + seconds
+
+    def get_node(*arguments: Any) -> Any:
+        while True:
+            try:
+                return ask(*arguments)
+            except RuntimeError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.5)
+
+    services.get_node = get_node
+    try:
+        yield
+    finally:
+        services.get_node = ask
+
+
+def _end_processes() -> None:
+    """Kill what is left of a Ray that this process started: its servers, and by them its agents and workers."""
+    _kill(_family())
+
+
+def _family() -> list[psutil.Process]:
+    return [child for child in psutil.Process().children(recursive=True) if _is_rays(child)]
+
+
+def _kill(processes: list[psutil.Process]) -> None:
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(processes, timeout=5)
+
+
+def _is_rays(process: psutil.Process) -> bool:
+    with suppress(psutil.Error):
+        words = process.cmdline()
+        return process.name() in _SERVERS or any(_PACKAGE in word or word.startswith("ray::") for word in words)
+    return False
+
+
+@contextmanager
+def own_ray() -> Iterator[None]:
+    """A Ray of this process, ended with the block. When one of its servers dies, so does the block: Ray itself would
+    wait for a minute and then end the process without a word.
+
+    Raises
+    ------
+    ClusterError
+        It did not start, or a server died.
+    """
+    import ray
+
+    _start()
+    watch = _Watch()
+    try:
+        with _interrupted_by(watch):
+            try:
+                yield
+            finally:
+                watch.over = True
+                ray.shutdown()
+    except BaseException as error:
+        if not watch.lost:
+            raise
+        raise ClusterError(watch.message) from error
+    finally:
+        watch.end_kin()
+        _end_processes()
+
+
+@contextmanager
+def _interrupted_by(watch: "_Watch") -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # which alone can be interrupted
+        yield
+        return
+    before = signal.signal(signal.SIGUSR1, _interrupt)
+    try:
+        with background(watch.run, name="ray-watch"):
+            yield
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+def _interrupt(*_: object) -> None:
+    """As Ctrl-C does: Ray's calls would turn any other exception into that one."""
+    raise KeyboardInterrupt
+
+
+class _Watch:
+    """Looks after the servers of the Ray that this process has started."""
+
+    def __init__(self) -> None:
+        self._kin = _family()
+        self._servers = {child.name(): child for child in self._kin if child.name() in _SERVERS}
+        self.lost = ""
+        self.over = False
+
+    @property
+    def message(self) -> str:
+        return (
+            f"Ray's {self.lost} has died (killed, or out of memory). What was complete is kept: run the same command "
+            "again to go on from here"
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        while not stop.wait(_LOOK_SECONDS):
+            dead = next((name for name, server in self._servers.items() if not _alive(server)), "")
+            if self.over:
+                return
+            if dead:
+                self.lost = dead
+                self._end_block(stop)
+                return
+
+    def _end_block(self, stop: threading.Event) -> None:
+        """Interrupt the block; end the process where that is not heeded: a call to a dead server may wait for ever.
+
+        What is left of Ray lives until then: its client library ends the process at once when the raylet goes.
+        """
+        main = threading.main_thread().ident
+        assert main is not None
+        self._kin += _family()  # of now: children of a parent that dies are nobody's
+        signal.pthread_kill(main, signal.SIGUSR1)
+        if not stop.wait(_LEAVE_SECONDS):
+            print(f"error: {self.message}", file=sys.stderr, flush=True)
+            self.end_kin()
+            os._exit(ClusterError.exit_status)
+
+    def end_kin(self) -> None:
+        """Kill all that belonged to this Ray."""
+        _kill(self._kin)
+
+
+def _alive(process: psutil.Process) -> bool:
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False

@@ -1,0 +1,72 @@
+"""Which weights a person means by a path, and where their evaluation goes."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.common.files import resolve_within
+from datagen.store import Dataset
+from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
+
+_WEIGHTS = ".safetensors"
+_WORDS: dict[str, Which] = {"result": "result", "latest": "latest", "best": "best"}
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Weights to evaluate: their checkpoint, the folder that their evaluation goes into, and what it is called by.
+
+    ``home`` is the run, or for exported weights their folder; ``label`` tells weights of one home apart ("": the
+    result of a run, or those that were exported as weights.safetensors).
+    """
+
+    checkpoint: Checkpoint
+    home: Path
+    label: str
+
+    @property
+    def weights(self) -> Path:
+        """The one checkpoint's folder or file, which stays the same while training goes on."""
+        return self.checkpoint.path
+
+    def folder(self, dataset: Dataset) -> Path:
+        """HOME/evaluation[-DATASET][-LABEL]; DATASET where it is another than the weights were trained on."""
+        own = self.checkpoint.dataset == dataset.uuid
+        other = "" if own else Path(dataset.url).stem
+        name = "-".join(filter(None, ("evaluation", other, self.label)))
+        resolve_within(self.home, name)
+        return self.home / name
+
+
+def evaluated(place: Path, which: Which = "result") -> Evaluated:
+    """The weights that a person names: a run, a workflow's folder, RUN/checkpoints/step-N, or exported weights.
+
+    Raises
+    ------
+    CheckpointError
+        There are none, or they are damaged.
+    """
+    checkpoint, step = require_checkpoint(place, which), _step_folder(place)
+    if step is not None:
+        return Evaluated(checkpoint, step.parent.parent, f"step-{checkpoint.step}")
+    if checkpoint.path == place:  # exported weights
+        is_file = place.suffix == _WEIGHTS
+        label = place.stem if is_file and place.stem != "weights" else ""
+        return Evaluated(checkpoint, place.parent if is_file else place, label)
+    label = "" if which in ("result", "latest") else f"step-{checkpoint.step}"
+    return Evaluated(checkpoint, checkpoint.path.parent.parent, label)
+
+
+def which_checkpoint(word: str) -> Which:
+    """``result``, ``latest``, ``best`` or a step, as it comes from a command line."""
+    if word in _WORDS:
+        return _WORDS[word]
+    if word.isdecimal():
+        return int(word)
+    raise argparse.ArgumentTypeError(f"{word!r} is none of result, latest, best, nor a step such as 2000")
+
+
+def _step_folder(place: Path) -> Path | None:
+    """RUN/checkpoints/step-N, where ``place`` is it or a file in it."""
+    folder = place.parent if place.suffix == _WEIGHTS else place
+    return folder if folder.parent.name == "checkpoints" and folder.name.startswith("step-") else None

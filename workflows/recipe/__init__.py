@@ -1,0 +1,1 @@
+"""Reading recipes by name, file or dataset."""

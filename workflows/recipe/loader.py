@@ -1,0 +1,251 @@
+"""The recipe of a whole workflow: its sections, reading it from YAML, overrides, and errors a person can act on."""
+
+import os
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from datagen.bodies import FAMILIES
+from datagen.common.errors import RecipeError
+from datagen.poses import SOURCES
+from datagen.recipe import ANIMALS, DatasetRecipe, Frozen
+from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
+from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
+from training.recipes.training import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
+from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
+from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
+
+
+def with_absolute_paths(values: Any, folder: Path) -> Any:
+    """The same with absolute paths of files that lie in ``folder``: tasks run in other folders.
+
+    Raises
+    ------
+    RecipeError
+        On a cluster, where this folder is a copy that is thrown away, a path is relative.
+    """
+    if isinstance(values, dict):
+        return {
+            key: _absolute(value, folder, key in TRAINING_PATH_KEYS)
+            if key in DATA_PATH_KEYS | TRAINING_PATH_KEYS
+            else with_absolute_paths(value, folder)
+            for key, value in values.items()
+        }
+    return [with_absolute_paths(value, folder) for value in values] if isinstance(values, list) else values
+
+
+def _absolute(value: Any, folder: Path, always: bool) -> Any:
+    """Data's paths that do not lie in the folder may be found elsewhere; training's may be folders still to be made."""
+    if not isinstance(value, str) or value in ("", ANIMALS) or "://" in value:
+        return value
+    path = Path(value).expanduser()
+    if not (always or (folder / path).exists()):
+        return value
+    if "RAY_ADDRESS" in os.environ and not path.is_absolute():
+        raise RecipeError(
+            f"{value!r} is a relative path, which other machines do not have. On a cluster name a full one"
+        )
+    return str((folder / path).resolve())
+
+
+__all__ = [
+    "WorkflowRecipe",
+    "change_recipe",
+    "check_recipe",
+    "describe_fields",
+    "known_recipes",
+    "load_recipe",
+    "override_values",
+    "recipe_faults",
+    "save_recipe",
+    "with_absolute_paths",
+]
+
+
+class WorkflowRecipe(Frozen):
+    """Everything that a workflow does, apart from where its files go."""
+
+    description: str = Field("", description="one line for people")
+    data: DatasetRecipe = Field(default_factory=DatasetRecipe)
+    training: TrainingRecipe = Field(default_factory=TrainingRecipe)
+    evaluation: EvaluationRecipe = Field(default_factory=EvaluationRecipe)
+
+    @model_validator(mode="after")
+    def _stops_by_what_there_is(self) -> "WorkflowRecipe":
+        sizes = {
+            "data.poses.unseen": self.data.poses.unseen,
+            "data.identities.evaluation": self.data.identities.evaluation,
+            "data.triples.count": self.data.triples.count,
+        }
+        missing = [name for name, size in sizes.items() if size == 0]
+        if self.training.early_stopping and missing:
+            raise ValueError(
+                f"training.early_stopping goes by the PMD on unseen poses, but {missing[0]} is 0: "
+                f"set {missing[0]}, or training.early_stopping=null"
+            )
+        return self
+
+
+def load_recipe(name_or_file: str, overrides: Sequence[str] = ()) -> WorkflowRecipe:
+    """Read a recipe by name or file, or from a dataset, apply overrides ``section.key=value``, and check all of it.
+
+    Raises
+    ------
+    RecipeError
+        No such recipe, not YAML, an unknown key (the nearest one is named), or a value that cannot be.
+    """
+    return change_recipe(_find(name_or_file), overrides, where=str(name_or_file))
+
+
+def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, where: str) -> WorkflowRecipe:
+    """A recipe from a file or from values, with overrides; the errors are those of :func:`load_recipe`."""
+    folder = base.resolve().parent if isinstance(base, Path) else Path.cwd()
+    name, words = _named_by(parse_words(overrides, option="--set "))
+    values = read_values(base) if isinstance(base, Path) else base
+    require_plain(values, where=f"recipe {where}")
+    if not isinstance(values, dict):
+        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
+    values = with_absolute_paths(_with_training(values, name), folder)
+    here = Path.cwd()
+    words = [(key, with_absolute_paths({(last := key.rsplit(".", 1)[-1]): value}, here)[last]) for key, value in words]
+    return check_recipe(changed(values, words, kinds=_KINDS), where=where)
+
+
+def override_values(overrides: Sequence[str]) -> dict[str, Any]:
+    """Nested values of ``section.key=value`` words.
+
+    Raises
+    ------
+    RecipeError
+        A word is not of that form.
+    """
+    return changed({}, parse_words(overrides, option="--set "))
+
+
+def _named_by(words: Words) -> tuple[str | None, Words]:
+    """The training recipe that ``training=NAME`` asks for, if any, and the other overrides, which refine it."""
+    names = [value for key, value in words if key == "training" and isinstance(value, str)]
+    others = [(key, value) for key, value in words if not (key == "training" and isinstance(value, str))]
+    return (names[-1] if names else None), others
+
+
+def _with_training(values: dict[str, Any], name: str | None) -> dict[str, Any]:
+    """The same with a training recipe in the place of its name, or the one named here in the place of any."""
+    if name is None and isinstance(values.get("training"), str):
+        name = values["training"]
+    return values if name is None else {**values, "training": named_training(name)}
+
+
+def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
+    """A recipe from nested values.
+
+    Raises
+    ------
+    RecipeError
+        With one line a fault: which key, what is wrong, what was given.
+    """
+    if not isinstance(values, dict) or not values:
+        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
+    with recipe_faults(where):
+        return WorkflowRecipe.model_validate(values)
+
+
+@contextmanager
+def recipe_faults(where: str) -> Iterator[None]:
+    """Turn a failed validation into one line a fault: which key, what is wrong, what was given."""
+    try:
+        yield
+    except ValidationError as error:
+        faults = faults_text(error, _describe)
+        raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help") from error
+
+
+def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
+    """Write the resolved recipe as YAML."""
+    import yaml
+
+    from datagen.common.files import write_atomically
+
+    write_atomically(path, yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
+
+
+def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -> Iterator[str]:
+    """One line for each key of the recipe: dotted name, default, meaning."""
+    for name, field in model.model_fields.items():
+        is_list = get_origin(field.annotation) is tuple
+        parts = [] if is_list else list(_parts(field.annotation))
+        sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+        if sections == [TrainingRecipe]:
+            names = ", ".join(known_trainings())
+            yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
+        for section in sections:
+            yield from describe_fields(section, f"{prefix}{name}.")
+        if not sections:
+            default = field.get_default(call_default_factory=True)
+            shown = (
+                [part.model_dump() for part in default]
+                if is_list and default and isinstance(default[0], BaseModel)
+                else default
+            )
+            words = textwrap.wrap(field.description or "", 100)
+            yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
+
+
+_KINDS = (
+    ("data.body", "family", None),
+    ("data.poses.distribution", "name", None),
+    ("training.network", "name", DEFAULT_NETWORK),
+)
+"""Sections of which there are several kinds, the key that says which, and which it is where that key is left out."""
+
+
+def _find(name_or_file: str) -> Path | dict[str, Any]:
+    """The file of a recipe, or the recipe that is stored with a dataset."""
+    known = known_recipes()
+    if name_or_file in known:
+        return known[name_or_file]
+    if "://" in name_or_file or name_or_file.rstrip("/").endswith(".zarr"):
+        from datagen.store.verify import require_recipe
+
+        return {"data": require_recipe(name_or_file).model_dump(mode="json")}
+    path = Path(name_or_file)
+    if path.suffix in (".yaml", ".yml"):
+        if path.is_file():
+            return path
+        raise RecipeError(f"no recipe file {path}")
+    if name_or_file in known_trainings():
+        raise RecipeError(
+            f"{name_or_file!r} is a recipe of training only. Add to another: --set training={name_or_file}"
+        )
+    raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
+
+
+def _describe(fault: Any) -> str:
+    # pydantic puts the name of a union's chosen member into the location; a person never wrote it
+    location = [str(part) for part in fault["loc"]]
+    parts = zip(["", *location], location, strict=False)
+    key = ".".join(part for before, part in parts if not (before in _UNIONS and part in _MEMBERS))
+    if fault["type"] == "extra_forbidden":
+        known = [line.split()[0] for line in describe_fields()]
+        if key in known:
+            return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
+        return f"unknown key {shown(key)}{nearest(key, known)}"
+    return fault_text(fault, key=key)
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    members = get_args(annotation)
+    if isinstance(annotation, type) or not members:
+        yield annotation
+    else:
+        for member in members:
+            yield from _parts(member)
+
+
+_NO_SECTIONS = "is not a mapping of sections (data, training, evaluation), or is empty"
+_UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
+_MEMBERS = {*FAMILIES, *SOURCES, *NETWORK_NAMES}

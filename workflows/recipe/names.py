@@ -1,0 +1,44 @@
+"""The recipes and training recipes that come with the project, by name."""
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+from datagen.common.errors import RecipeError
+from datagen.recipe.text import read_values
+
+_FOLDER = Path(__file__).parents[1] / "recipes"
+
+
+def known_recipes() -> dict[str, Path]:
+    """Files of whole recipes, by name."""
+    return _files(_FOLDER)
+
+
+def known_trainings() -> dict[str, Path]:
+    """Files of published training recipes, by name: ``training: NAME`` means what one says in that section."""
+    return _files(_FOLDER / "training")
+
+
+def named_training(name: str) -> dict[str, Any]:
+    """The training section of that name.
+
+    Raises
+    ------
+    RecipeError
+        There is none; the nearest and all others are named.
+    """
+    known = known_trainings()
+    if name not in known:
+        raise RecipeError(f"no training recipe {name!r}{nearest(name, list(known))}; there are {', '.join(known)}")
+    return dict(read_values(known[name])["training"])
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """Words that suggest the known name nearest to one that is not, or none."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}

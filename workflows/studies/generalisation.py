@@ -1,0 +1,225 @@
+"""Generalisation as a command: its options, its files, what it prints."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from datagen.common.errors import RecipeError
+from datagen.common.files import write_atomically
+from datagen.recipe import AnnyTopology, DatasetRecipe
+from datagen.recipe.base import LARGEST
+from training.evaluation.generalisation import (
+    GeneralisationRow,
+    Kind,
+    cases_between,
+    grid_of,
+    grid_table,
+    have_truth,
+    measured,
+    pairs_with_truth,
+    read_rows,
+    write_rows,
+)
+from training.evaluation.measure import LoadedMethod
+from training.evaluation.robustness import Case, methods_in
+from training.reports.markup import plain
+from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
+from workflows.pipeline.console import print_text
+from workflows.pipeline.progress import bar
+from workflows.pipeline.ray_cluster import require_reachable
+from workflows.pipeline.stage import say
+from workflows.pipeline.weights_argument import Evaluated
+from workflows.recipe.loader import load_recipe
+from workflows.studies.common import (
+    about_weights,
+    add_weights_options,
+    folder_of,
+    methods_of,
+    same_settings,
+    study,
+    sync_words,
+    weights_of,
+)
+from workflows.studies.mesh_kinds import OTHERS, TOPOLOGIES, Sizes, imported_kind, make_kinds, own_kind, own_recipe
+
+_FILES = ("generalisation.md", "rows.csv", "heat-map.png", "examples.png")
+_FIRST_RECIPE = "quickstart"
+
+EXAMPLES = """\
+  dsffnet generalisation runs/quickstart/run
+  dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
+  dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr"""
+
+
+def add_generalisation_options(made: argparse.ArgumentParser) -> None:
+    """Options of the study."""
+    add_weights_options(made)
+    sizes, add = Sizes(), made.add_argument
+    known = tuple(its for its in get_args(AnnyTopology) if its != "makehuman")
+    add(
+        "--topologies", nargs="+", choices=known, default=list(TOPOLOGIES), metavar="NAME",
+        help=f"Anny's meshes to make (default: all of {', '.join(TOPOLOGIES)})",
+    )  # fmt: skip
+    add(
+        "--others", nargs="*", choices=OTHERS, default=list(OTHERS), metavar="NAME",
+        help="smpl (the stand-in in SMPL's format), animals (the CC0 ones); nothing: neither (default: both)",
+    )  # fmt: skip
+    add("--data", nargs="+", default=[], metavar="X.zarr", help="datasets of your own: FAUST, MultiGarment, any")
+    add(
+        "--recipe", metavar="NAME|FILE|X.zarr",
+        help=f"whose people and poses (default: the first run's dataset, or {_FIRST_RECIPE})",
+    )  # fmt: skip
+    add("--identities", type=int, default=sizes.identities, metavar="N", help="new identities (default 4)")
+    add("--poses", type=int, default=sizes.poses, metavar="N", help="new poses (default 8)")
+    add("--triples", type=int, default=sizes.triples, metavar="N", help="transfers for each pair (default 16)")
+    add("--seed", type=int, default=sizes.seed, metavar="N", help="of people, poses, transfers (default 1000)")
+
+
+def generalisation_command(options: argparse.Namespace) -> None:
+    """Transfer between bodies and vertex counts that the weights were not trained on, and measure it."""
+    sizes = _sizes(options)
+    weights = weights_of(options)
+    base, methods = _base(options, weights), methods_of(weights)
+    folder = folder_of(options, weights, "generalisation")
+    extra = [imported_kind(require_reachable(url, option="--data", urls=True)) for url in options.data]
+    kinds = make_kinds(base, options.topologies, options.others, folder / "data", sizes, say=say) + extra
+    _require_names(kinds)
+    settings = {
+        "weights": about_weights(weights),
+        "methods": [method.name for method in methods],
+        "kinds": {kind.name: kind.dataset.uuid for kind in kinds},
+        "triples": sizes.triples,
+    }
+    with study(folder, "generalisation", weights, settings, _FILES) as metrics:
+        rows = _measured(folder, settings, methods, kinds, sizes)
+        names, trained = [kind.name for kind in kinds], [_trained(its, kinds) for its in weights]
+        title = f"PMD (1e-4), {sizes.triples} transfers a cell; frame: as trained; last line: the target unchanged"
+        heat_map(rows, names, folder / "heat-map.png", title=title, trained=trained)
+        shown = examples(kinds, trained[0] or names[0])
+        title = "Transfers between kinds of meshes: the first of each pair's list, not chosen by result"
+        generalisation_picture(shown, methods, folder / "examples.png", title=title)
+        text = report(rows, methods, kinds, sizes, trained)
+        write_atomically(folder / "generalisation.md", text.encode())
+        metrics.update(_metrics(rows, names))
+    print_text(
+        f"{text}\npictures, rows, data, this text: {folder} ({', '.join(_FILES)}). To MLflow: {sync_words(folder)}"
+    )
+
+
+def _sizes(options: argparse.Namespace) -> Sizes:
+    if options.identities < 2 or options.poses < 2 or options.triples < 1 or options.seed < 0:
+        raise RecipeError(
+            f"--identities {options.identities} --poses {options.poses} --triples {options.triples} "
+            f"--seed {options.seed}: a transfer needs two identities and two poses; use 2, 2, 1, 0 or more"
+        )
+    if max(options.identities, options.poses, options.triples, options.seed) > LARGEST:
+        raise RecipeError("--identities, --poses, --triples and --seed have 18 digits at most")
+    return Sizes(options.identities, options.poses, options.triples, options.seed)
+
+
+def _base(options: argparse.Namespace, weights: Sequence[Evaluated]) -> DatasetRecipe:
+    if options.recipe:
+        return load_recipe(options.recipe).data
+    own = own_recipe(weights[0].home)
+    if own is None:
+        say(f"generalisation: the dataset of {weights[0].home} is not there; people and poses of {_FIRST_RECIPE}")
+    return own or load_recipe(_FIRST_RECIPE).data
+
+
+def _require_names(kinds: Sequence[Kind]) -> None:
+    names = [kind.name for kind in kinds]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise RecipeError(f"two datasets would both be called {twice[0]!r}. Name each once, or rename a folder")
+
+
+def _trained(weights: Evaluated, kinds: Sequence[Kind]) -> str:
+    """The kind that weights were trained on, empty where it is none of these or not known."""
+    own = own_recipe(weights.home)
+    return own_kind(own, kinds) if own else ""
+
+
+def _measured(
+    folder: Path, settings: dict[str, Any], methods: Sequence[LoadedMethod], kinds: Sequence[Kind], sizes: Sizes
+) -> list[GeneralisationRow]:
+    same_settings(folder, settings)
+    rows = read_rows(folder / "rows.csv")
+    found = measured(methods, kinds, triples=sizes.triples, done=rows)
+    for some in bar(found, total=len(pairs_with_truth(kinds)), what="generalise", unit="pair"):
+        if some:
+            rows += some
+            write_rows(rows, folder / "rows.csv")
+    return rows
+
+
+def examples(kinds: Sequence[Kind], trained: str) -> list[Shown]:
+    """Transfers to draw: to and from every other kind in turn, and, where truth lies in a kind alone, within it."""
+    own = next(kind for kind in kinds if kind.name == trained)
+    found = []
+    for number, kind in enumerate(its for its in kinds if its is not own):
+        if have_truth(own, kind):
+            pairs = [(own, kind) if number % 2 == 0 else (kind, own)]
+        else:
+            pairs = [(kind, kind), (own, kind), (kind, own)]
+        found += [_shown(source, target) for source, target in pairs]
+    return found or [_shown(own, own)]
+
+
+def _shown(source: Kind, target: Kind) -> Shown:
+    label = f"{_in_lines(source.name)}\nto\n{_in_lines(target.name)}"
+    if have_truth(source, target):
+        return Shown(label, cases_between(source, target, 1)[0])
+    (pose_from,), (body_from,) = cases_between(source, source, 1), cases_between(target, target, 1)
+    without = Case(0, pose_from.triple, pose_from.source, body_from.target, body_from.target)
+    return Shown(label, without, truth_known=False)
+
+
+def _in_lines(name: str) -> str:
+    return name if len(name) < 13 else "\n".join(name.rsplit(" ", 1))
+
+
+def _metrics(rows: Sequence[GeneralisationRow], names: Sequence[str]) -> dict[str, float]:
+    """PMD (1e-4) of each method over all pairs between kinds, and within them."""
+    found = {}
+    for method in methods_in(rows):
+        values: dict[bool, list[float]] = {True: [], False: []}
+        for row in rows:
+            if row.method == method:
+                values[row.source_kind == row.target_kind].append(row.pmd * 1e4)
+        name = method.replace(" ", "_").translate(str.maketrans("", "", "()"))
+        for within, its in values.items():
+            if its:
+                found[f"pmd/{'within' if within else 'between'}/{name}"] = sum(its) / len(its)
+    return found
+
+
+def report(
+    rows: Sequence[GeneralisationRow],
+    methods: Sequence[LoadedMethod],
+    kinds: Sequence[Kind],
+    sizes: Sizes,
+    trained: Sequence[str],
+) -> str:
+    """The study as Markdown."""
+    names = [kind.name for kind in kinds]
+    whose = "; ".join(
+        f"{plain(method.name)}: step {method.step:,}, trained on {plain(own) or 'none of these kinds'}"
+        for method, own in zip(methods, trained, strict=True)
+    )
+    grids = "\n\n".join(
+        f"## {plain(name)}\n\nPMD x1e-4\n\n{grid_table(rows, names, name)}\n\nmm\n\n"
+        f"{grid_table(rows, names, name, field='millimetres', factor=1)}"
+        for name in methods_in(rows)
+        if grid_of(rows, names, name).size
+    )
+    return (
+        f"# Generalisation to other bodies and vertex counts\n\nWeights: {whose}. {sizes.identities} new identities in "
+        f"{sizes.poses} new poses of each kind, {sizes.triples} transfers a pair (a dataset of your own: its own "
+        "triples). All Anny kinds are the same people; the stand-in in SMPL's format has people of its own in the same "
+        "poses; animals have poses of their own, so that between them and people there is no ground truth. PMD: mean "
+        "over vertices and coordinates of (output - truth)^2 in the normalised box; mm: mean distance of a vertex. "
+        "Pairs down to across: source to target; –: no ground truth is known, or the network takes "
+        "no other vertex count.\n\n![heat map](heat-map.png)\n\n![examples](examples.png)\n\n"
+        f"{grids}\n"
+    )

@@ -1,0 +1,1 @@
+"""Posing a person's own mesh files."""

@@ -1,0 +1,209 @@
+"""A transfer at work: how the meshes stand, what to warn of, the frames, and what a person looks at."""
+
+import contextlib
+import os
+import shutil
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.common.errors import MeshError, storage_errors
+from datagen.common.files import write_atomically
+from datagen.common.printable import printable
+from datagen.mesh.files import MeshFile, posed_bytes, write_posed
+from datagen.mesh.geometry import Mesh
+from datagen.mesh.sequences import require_animation, write_animation
+from training.inference.domain_check import remarks, seen_by
+from training.inference.orientation import UPRIGHT, Axes, orientation
+from training.inference.refinement import DEFAULT_WEIGHT
+from training.inference.transfer import PoseTransfer
+from workflows.pipeline.progress import bar
+from workflows.transfer.job import TransferJob
+
+if TYPE_CHECKING:
+    from training.viz.transfer_picture import NamedMesh
+
+_SHOWN_FRAMES = 4  # of a sequence, in its picture
+_VOTING_FRAMES = 3  # of a sequence, on how it stands
+
+
+def warn(line: str) -> None:
+    """One line on standard error."""
+    print(f"warning: {printable(line)}", file=sys.stderr)
+
+
+class TransferWork:
+    """A job whose meshes are read and whose network is loaded."""
+
+    def __init__(self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile) -> None:
+        """``first`` is the source, or the first frame of a sequence."""
+        self.job, self.transfer, self.first, self.target = job, transfer, first, target
+        self.axes = job.axes or (UPRIGHT, UPRIGHT)
+        self._shown: dict[int, Mesh] = {}
+
+    def settle_axes(self, weights: Path) -> None:
+        """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
+        errors = self.transfer.self_errors
+        ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
+        self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
+        seen = seen_by(weights)
+        meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
+        for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
+            both = ways[0].axes, ways[1].axes
+            if self.job.axes is None and not way.is_certain:
+                warn(f"--align leaves {path} as it is: how it stands is not certain")
+            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, told=self.job.is_told, seen=seen):
+                warn(line)
+
+    def run(self) -> str:
+        """Write everything; what was done, in a line."""
+        done = self._write_sequence() if self.job.is_sequence else self._write_pair()
+        if self.job.drawn:
+            self._draw()
+        return done
+
+    def _votes(self) -> list[NDArray[np.floating]]:
+        count = len(self.job.sources)
+        others = {count * place // _VOTING_FRAMES for place in range(1, _VOTING_FRAMES)} - {0}
+        return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
+
+    def _source(self, number: int) -> Mesh:
+        return self.first if number == 0 else self.job.read_source(number).mesh
+
+    def _write_pair(self) -> str:
+        job, posed = self.job, next(self._posed())
+        self._write_posed(posed, job.out)
+        return f"{job.out}: {len(posed.vertices):,} vertices of {job.target} in the pose of {job.sources[0]}"
+
+    def _write_sequence(self) -> str:
+        job = self.job
+        about = f"{job.out}: {len(job.sources)} frames of {job.target}"
+        if job.is_file:
+            require_animation(self.target, len(job.sources))
+            self._animate(self._posed(), job.animation)
+            return about
+        with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
+            try:
+                require_animation(self.target, len(job.sources))
+            except MeshError as error:
+                warn(f"no {job.animation.name}: {error}")
+                deque(self._saved(folder), maxlen=0)
+                return about
+            self._animate(self._saved(folder), folder / job.animation.name)
+        return f"{about}, and all of them in {job.animation.name}"
+
+    def _animate(self, frames: Iterable[Mesh], out: Path) -> None:
+        vertices = (frame.vertices for frame in frames)
+        write_animation(self.target, vertices, out, frames_per_second=self.job.fps)
+
+    def _saved(self, folder: Path) -> Iterator[Mesh]:
+        """The frames, each written to its file as it passes."""
+        for number, posed in enumerate(self._posed()):
+            place = folder / self.job.frame_file(self.job.sources[number]).name
+            if number:  # what lies beside the first lies beside all
+                write_atomically(place, posed_bytes(self.target, posed.vertices, place.suffix))
+            else:
+                self._write_posed(posed, place)
+            yield posed
+
+    def _write_posed(self, posed: Mesh, out: Path) -> None:
+        for lost in write_posed(self.target, posed.vertices, out):
+            warn(lost)
+
+    def _posed(self) -> Iterator[Mesh]:
+        """The output of every frame; those that the picture shows are kept."""
+        count = len(self.job.sources)
+        kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
+        frames = self.transfer.sequence(
+            map(self._source, range(count)),
+            self.target.mesh,
+            smooth=self.job.window,
+            refine=DEFAULT_WEIGHT if self.job.refine else 0.0,
+            source_axes=self.axes[0],
+            target_axes=self.axes[1],
+        )
+        passing = bar(frames, total=count, what="transfer", unit="frame") if self.job.is_sequence else frames
+        for number, posed in enumerate(passing):
+            if number in kept:
+                self._shown[number] = posed
+            yield posed
+
+    def _draw(self) -> None:
+        from training.viz.transfer_picture import shown, write_page, write_picture
+
+        job = self.job
+        rows = [
+            shown(
+                _upright(self._source(number), self.axes[0], job.sources[number]),
+                _upright(self.target.mesh, self.axes[1], job.target),
+                _upright(posed, self.axes[1], job.frame_file(job.sources[number]) if job.is_sequence else job.out),
+            )
+            for number, posed in self._shown.items()
+        ]
+        if job.picture:
+            write_picture(rows, job.beside(".png"))
+        if job.viewer:
+            write_page(rows, job.beside(".html"))
+
+
+def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
+    from training.viz.transfer_picture import (
+        NamedMesh,  # it brings matplotlib, which a transfer does not need otherwise
+    )
+
+    return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
+
+
+def _move(path: Path, place: Path, *, is_own: bool) -> None:
+    if not is_own and place.exists() and place.read_bytes() != path.read_bytes():
+        warn(f"{place.name}: another file of that name is in {place.parent} and was left as it is")
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(path, place)
+
+
+@contextmanager
+def _appearing_whole(out: Path, *, own: set[str]) -> Iterator[Path]:
+    """A folder beside ``out`` to write into, whose files move there only if the block succeeds; else they stay in it.
+
+    Those of ``own`` take the place of an earlier run's; materials and textures leave other files of their name alone.
+    """
+    with storage_errors(out):
+        folder = _new_folder(out)
+        try:
+            yield folder
+            for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+                name = path.relative_to(folder)
+                _move(path, out / name, is_own=str(name) in own)
+        except KeyboardInterrupt as interrupt:
+            raise KeyboardInterrupt(f"{_finished_in(folder, own)}; the same command begins again") from interrupt
+        except BaseException:
+            warn(_finished_in(folder, own))
+            raise
+        shutil.rmtree(folder)
+
+
+def _new_folder(out: Path) -> Path:
+    """``out``.unfinished, numbered where an earlier run left one."""
+    for number in count(1):
+        folder = out.with_name(f"{out.name}.unfinished{'' if number == 1 else f'-{number}'}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            return folder
+    raise AssertionError("there are numbers without end")
+
+
+def _finished_in(folder: Path, own: set[str]) -> str:
+    """How many frames are finished, and where a person finds them; a folder without any is removed."""
+    finished = sum(path.name in own for path in folder.iterdir())
+    if finished:
+        return f"{finished:,} {'frame is' if finished == 1 else 'frames are'} finished, in {folder}"
+    shutil.rmtree(folder, ignore_errors=True)
+    return "no frame is finished"
