@@ -42,7 +42,7 @@ FOUR = """\
 def run(script: str, out: Path, methods: str) -> str:
     recipe = out.parent / f"{script}.yaml"
     recipe.write_text(LEGS + methods)
-    command = [sys.executable, f"workflows/{script}.py", "--recipe", str(recipe), "--out", str(out)]
+    command = [sys.executable, "-m", "workflows", script, "--recipe", str(recipe), "--out", str(out)]
     own = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
     done = subprocess.run(command, cwd=ROOT, env=own, capture_output=True, text=True, timeout=400, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
