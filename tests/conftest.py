@@ -1,12 +1,25 @@
 """Shared fixtures: a tiny dataset of the procedural leg, made once a session and copied where a test spoils it."""
 
 import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signals_are_heeded() -> Iterator[None]:
+    """A suite that was started in the background has Ctrl-C (under nohup: SIGHUP) ignored, as have its children."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

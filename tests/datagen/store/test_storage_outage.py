@@ -28,6 +28,7 @@ from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset
 from training.data.vertex_bank import open_bank
 from workflows.cli.main import main
+from workflows.pipeline import tasks
 
 SHARD = "identity/0001/vertices/c/0/0/0"
 
@@ -247,7 +248,7 @@ def test_s3_that_goes_away_in_the_middle(
                 process.wait()
             yield row
 
-    monkeypatch.setattr(generation, "inline", killing)
+    monkeypatch.setattr(tasks, "inline", killing)
     began = time.monotonic()
     with pytest.raises(SystemExit):
         main(["generate", "--recipe", "smoke", "--local", "--out", "s3://datasets/other.zarr"])
