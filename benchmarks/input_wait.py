@@ -4,7 +4,7 @@ DSFFNet at the quickstart's widths and at the paper's, batch 8, on a grid of pro
 the quickstart's bodies (615) and SMPL (6,890). A streamed bank may hold a quarter of the meshes. A step is input,
 forward, both losses, backward and AdamW, and ends when its loss is known, as the trainer's does. ``wait`` is the time
 in which the step stands still for its batch; a thread that reads ahead may also slow the rest down, so the step is
-compared with memory's, too. Every cache runs in turn, in blocks.
+compared with that of meshes in memory, too. Every cache runs in turn, in blocks.
 """
 
 from __future__ import annotations
@@ -20,21 +20,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from datagen.generate import generate
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
-from training.data.batch import EdgeTable
 from training.data.triples import TripleOrder
-from training.data.vertex_bank import Bank, open_bank, streamed_bank
+from training.data.vertex_bank import VertexBank, open_bank
 from training.data.vertex_layout import Layout
 from training.networks.dsffnet import DSFFNet
-from training.objectives.losses import pose_transfer_loss
+from training.objectives.losses import transfer_loss
 
 GOAL = 0.02
 BATCH = 8
-CACHES = ("memory", "mapped", "stream")
+CACHES = ("device", "stream")
 
 
 class Case(NamedTuple):
@@ -77,8 +76,8 @@ def main() -> None:
 
 def show(title: str, times: dict[str, Times]) -> None:
     """One case's table; medians of steps, and the share over all steps together."""
-    print(f"\n{title}\n  {'cache':8}{'step ms':>10}{'wait ms':>10}{'longest':>10}{'share':>8}{'step / memory':>15}")
-    usual = statistics.median(times["memory"].step) if "memory" in times else float("nan")
+    print(f"\n{title}\n  {'cache':8}{'step ms':>10}{'wait ms':>10}{'longest':>10}{'share':>8}{'step / device':>15}")
+    usual = statistics.median(times["device"].step)
     for cache, (wait, step) in times.items():
         middle, share = statistics.median(step), sum(wait) / sum(step)
         print(
@@ -95,7 +94,7 @@ def measure(case: Case, folder: Path, device: torch.device, options: argparse.Na
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-6)
     steps = 10 if options.quick else case.steps if device.type == "cpu" else 150
     order = TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), BATCH, seed=0)
-    banks = {cache: bank_of(cache, dataset, folder, device) for cache in names(device)}
+    banks = {cache: bank_of(cache, dataset, device) for cache in CACHES}
     times = {cache: Times([], []) for cache in banks}
     for turn in range(options.rounds):
         for cache, bank in banks.items():
@@ -105,13 +104,8 @@ def measure(case: Case, folder: Path, device: torch.device, options: argparse.Na
     return times
 
 
-def names(device: torch.device) -> tuple[str, ...]:
-    """The caches that differ on a device."""
-    return CACHES if device.type == "cpu" else ("device", *CACHES)
-
-
 def block(
-    bank: Bank,
+    bank: VertexBank,
     order: TripleOrder,
     first: int,
     steps: int,
@@ -127,7 +121,7 @@ def block(
 
 
 def timed(
-    bank: Bank, shares: Iterator[list[object]], network: nn.Module, optimiser: torch.optim.Optimizer
+    bank: VertexBank, shares: Iterator[list[object]], network: nn.Module, optimiser: torch.optim.Optimizer
 ) -> Iterator[tuple[float, float]]:
     """Seconds of the wait for input, and of the whole step."""
     while True:
@@ -136,22 +130,19 @@ def timed(
         batch = bank.batch(triples)  # type: ignore[arg-type]
         waited = time.perf_counter() - began
         optimiser.zero_grad(set_to_none=True)
-        assert isinstance(batch.edges, Tensor)
-        loss, _ = pose_transfer_loss(network(source=batch.source, target=batch.target), batch.truth, batch.edges)
+        prediction = network(source=batch.source, target=batch.target)
+        loss, _ = transfer_loss(prediction, truth=batch.truth, target=batch.target, edges=batch.edges)
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         loss.item()
         yield waited, time.perf_counter() - began
 
 
-def bank_of(cache: str, dataset: Dataset, folder: Path, device: torch.device) -> Bank:
+def bank_of(cache: str, dataset: Dataset, device: torch.device) -> VertexBank:
     """A bank of the training meshes; a streamed one holds a quarter of them."""
     identities = dataset.identities("training")
-    if cache == "stream":
-        layout = Layout(dataset, identities)
-        edges = EdgeTable(dataset, identities, device=device)
-        return streamed_bank(layout, edges, device=device, memory=layout.bytes // 4)
-    return open_bank(dataset, identities, device=device, cache=cache, folder=folder / "cache")  # type: ignore[arg-type]
+    memory = Layout(dataset, identities).bytes // 4
+    return open_bank(dataset, identities, device=device, cache=cache, memory=memory)  # type: ignore[arg-type]
 
 
 def legs(case: Case, folder: Path, poses: int) -> Dataset:

@@ -29,7 +29,7 @@ from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.execution import Precision
 from training.networks.npt import NPT
-from training.objectives.losses import pose_transfer_loss
+from training.objectives.losses import transfer_loss
 
 # isort: split
 from tests.literal.corenet3d import LiteralCoreNet3D
@@ -142,7 +142,7 @@ def step_times(forms: dict[str, nn.Module], meshes: Meshes, repeats: int) -> dic
 
 def both_losses(moved: Tensor, meshes: Meshes) -> None:
     """Both losses of a prediction, and their gradients."""
-    pose_transfer_loss(moved, meshes.truth, meshes.edges)[0].backward()
+    transfer_loss(moved, truth=meshes.truth, target=meshes.target, edges=meshes.edges)[0].backward()
 
 
 def keep(times: dict[str, list[float]], form: str, repeat: int, work: Callable[[], object]) -> None:

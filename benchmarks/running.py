@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from training.networks.execution import Precision, autocast, precision, products
-from training.objectives.losses import pose_transfer_loss
+from training.objectives.losses import transfer_loss
 
 
 class Meshes(NamedTuple):
@@ -49,7 +49,7 @@ def backward(network: nn.Module, how: Precision, meshes: Meshes) -> None:
     with products(how):
         with autocast(how, meshes.source.device):
             prediction = network(source=meshes.source, target=meshes.target)
-        pose_transfer_loss(prediction, meshes.truth, meshes.edges)[0].backward()
+        transfer_loss(prediction, truth=meshes.truth, target=meshes.target, edges=meshes.edges)[0].backward()
 
 
 def step(network: nn.Module, how: Precision, optimiser: torch.optim.Optimizer, meshes: Meshes) -> None:

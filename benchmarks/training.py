@@ -75,7 +75,7 @@ def recipe_of(case: Case, steps: int) -> TrainingRecipe:
             "schedule": {"name": "constant"},
             "gradient_clip": 1.0,
             "device": "cpu",
-            "cache": "memory",
+            "cache": "device",
             "log_every": max(1, steps // 10),
         }
     )

@@ -1,4 +1,4 @@
-"""Meshes of a dataset that fits nowhere: read when they are needed, the last used ones kept, memory bounded.
+"""Meshes of a dataset that is larger than memory: read when needed, the last used ones kept, memory bounded.
 
 A mesh, not a shard, is what is kept. Triples are random over the whole grid, so a batch touches nearly as many shards
 as meshes; were shards kept, one mesh in a hundred of them would be of use soon. Meshes of many steps are asked for
@@ -18,8 +18,8 @@ from datagen.common.errors import RecipeError
 from datagen.common.resources import bytes_text
 from training.data.vertex_layout import Floats, Layout
 
-_READERS_HERE, _READERS_AFAR = 2, 16  # a remote store answers in some 30 ms, whatever is asked
-_REQUEST_BYTES_HERE, _REQUEST_BYTES_AFAR = 2**18, 2**21  # that are read and decoded in the time of one more request
+_LOCAL_READERS, _REMOTE_READERS = 2, 16  # a remote store answers in some 30 ms, whatever is asked
+_LOCAL_REQUEST_BYTES, _REMOTE_REQUEST_BYTES = 2**18, 2**21  # that are read and decoded in the time of one more request
 _FEWEST_SLOTS = 64
 
 
@@ -38,9 +38,9 @@ class StreamedMeshes:
         self._held = torch.from_numpy(np.zeros((self.slots, self.rows, 3), np.float32))  # takes memory as it fills
         self._slot: OrderedDict[int, int] = OrderedDict()
         self._guard = threading.RLock()
-        afar = "://" in layout.dataset.url.removeprefix("file://")
-        self._request_bytes = _REQUEST_BYTES_AFAR if afar else _REQUEST_BYTES_HERE
-        readers = _READERS_AFAR if afar else _READERS_HERE
+        remote = "://" in layout.dataset.url.removeprefix("file://")
+        self._request_bytes = _REMOTE_REQUEST_BYTES if remote else _LOCAL_REQUEST_BYTES
+        readers = _REMOTE_READERS if remote else _LOCAL_READERS
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="stream")
 
     def close(self) -> None:
@@ -61,7 +61,7 @@ class StreamedMeshes:
         if len(wanted) > self.slots:
             raise RecipeError(
                 f"a batch needs {len(wanted)} meshes at once, but streaming has memory for {self.slots} "
-                f"({bytes_text(12 * self.rows * self.slots)}). Lower training.batch or use --set training.cache=mapped"
+                f"({bytes_text(12 * self.rows * self.slots)}). Lower training.batch"
             )
         with self._guard:
             missing = np.array([mesh for mesh in wanted.tolist() if mesh not in self._slot], np.int64)

@@ -1,17 +1,15 @@
-"""The meshes of some identities, decoded and normalised, where there is room for them; batches of triples of them.
+"""The meshes of some identities, decoded and normalised, and batches of triples of them.
 
 >>> bank = open_bank(dataset, identities, device=device)                              # doctest: +SKIP
 >>> shares = bank.prefetch(order.batches(first_step=0, rank=0, ranks=2, parts=1))     # doctest: +SKIP
 >>> batches = [bank.batch(triples) for triples in next(shares)]                       # doctest: +SKIP
 
-A batch is the same to the bit from any place. ``device``: a GPU's memory, where a batch is a gather and nothing else.
-``memory``: each process' own copy. ``mapped``: a file that the processes of a machine share
-(:mod:`training.data.mmap_cache`). ``stream``: only what is needed soon (:mod:`training.data.streaming_cache`).
+A batch is the same to the bit from either place. ``device``: the memory of the device that trains, where a batch is a
+gather and nothing else. ``stream``: as many as memory has room for (:mod:`training.data.streaming_cache`).
 """
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -19,73 +17,62 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datagen.common.errors import DatasetError, StorageError
+from datagen.common.errors import DatasetError
 from datagen.common.resources import bytes_text
 from datagen.store import Dataset
 from training.data.batch import Batch, EdgeSum, EdgeTable, counts_of
-from training.data.cache_policy import Cache, Choice, Place, choose, default_folder, memory_room
-from training.data.mmap_cache import Log, map_vertices, mapped_path
+from training.data.cache_policy import Cache, Choice, choose, room_of, stream_memory
 from training.data.prefetch import Lookahead, Share
 from training.data.streaming_cache import StreamedMeshes
 from training.data.triples import Triples
-from training.data.vertex_layout import Floats, Layout, decode
+from training.data.vertex_layout import Layout, decode
 from training.networks.execution import sent
+
+_TOGETHER_BYTES = 2**26
+"""Of meshes that are streamed at a time; batches of three times as many may be ready."""
 
 
 class Meshes(Protocol):
     """Where vertices are."""
 
     def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
-        """Vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to the largest of the group."""
-
-    def fetch(self, meshes: NDArray[np.int64]) -> None:
-        """Make ready what will be gathered soon."""
+        """Return the vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to its largest."""
 
     def close(self) -> None:
-        """Give back what is held beside memory."""
+        """Release what is held beside memory."""
 
 
 class HeldMeshes:
-    """All vertices [vertex, 3] of a layout in one tensor: on a device, in memory, or mapped."""
+    """All vertices [vertex, 3] of a layout in one tensor on a device."""
 
     def __init__(self, layout: Layout, vertices: Tensor) -> None:
         self._vertices, self._layout, self._count = vertices, layout, layout.count
         self._device = vertices.device
 
     def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
-        """See :class:`Meshes`. Where to look is sent to the device once for all groups."""
+        """See :class:`Meshes`. The numbers of all groups are sent to the device together."""
         meshes, sizes = np.concatenate(groups), [len(group) for group in groups]
         if self._count is not None:
             whole = self._vertices.view(-1, self._count, 3)
             numbers = sent(torch.from_numpy(meshes), self._device)
-            return [whole.index_select(0, its) for its in torch.split_with_sizes(numbers, sizes)]
+            return [whole.index_select(0, group) for group in torch.split_with_sizes(numbers, sizes)]
         where = np.stack([self._layout.counts[meshes], self._layout.starts[meshes]])
         parts = torch.split_with_sizes(sent(torch.from_numpy(where), self._device), sizes, dim=1)
         longest = [int(self._layout.counts[group].max()) for group in groups]
         return [self._padded(part[0], part[1], rows) for part, rows in zip(parts, longest, strict=True)]
 
     def _padded(self, counts: Tensor, starts: Tensor, rows: int) -> Tensor:
-        """Vertices [mesh, rows, 3] of meshes of so many vertices that begin at these places; zeros behind them."""
+        """Vertices [mesh, rows, 3] of meshes of so many vertices that begin at these places; zeros after them."""
         places = torch.arange(rows, device=counts.device)
         inside = places < counts[:, None]
-        found = self._vertices.index_select(0, (starts[:, None] + torch.where(inside, places, 0)).flatten())
-        return found.view(*inside.shape, 3).masked_fill_(~inside[..., None], 0)
-
-    def fetch(self, meshes: NDArray[np.int64]) -> None:
-        """See :class:`Meshes`; all are there."""
+        vertices = self._vertices.index_select(0, (starts[:, None] + torch.where(inside, places, 0)).flatten())
+        return vertices.view(*inside.shape, 3).masked_fill_(~inside[..., None], 0)
 
     def close(self) -> None:
         """See :class:`Meshes`."""
 
 
-_TOGETHER_BYTES = (
-    2**26
-)  # of meshes that a streamed bank asks for at a time; batches of three times as many may be ready
-_STREAM_SHARE = 0.25  # of the free memory, for a streamed bank
-_LOGGER = logging.getLogger(__name__)
-
-
-class Bank:
+class VertexBank:
     """Batches of triples from meshes that are kept somewhere.
 
     Attributes
@@ -93,15 +80,14 @@ class Bank:
     where
         In words, where the meshes are kept and why there.
     place
-        The same in a word: device, memory, mapped or stream.
+        The same in a word: device or stream.
     """
 
     def __init__(
-        self, layout: Layout, meshes: Meshes, edges: EdgeTable, choice: Choice, *, device: torch.device, window: int = 0
+        self, layout: Layout, meshes: Meshes, edges: EdgeTable, choice: Choice, *, device: torch.device
     ) -> None:
         self._layout, self._meshes, self._edges, self._device = layout, meshes, edges, device
         self.where, self.place = choice.why, choice.place
-        self._window = window
         self._lookaheads: list[Lookahead] = []
         self._ready: dict[bytes, Batch] = {}
 
@@ -109,7 +95,7 @@ class Bank:
         return len(self._layout.counts)
 
     def batch(self, triples: Triples) -> Batch:
-        """The meshes of rows (source identity, source pose, target identity, target pose), on the bank's device.
+        """Return the meshes of rows (source identity, source pose, target identity, target pose), on the device.
 
         Raises
         ------
@@ -122,15 +108,15 @@ class Bank:
         return (ready or self._assemble(triples)).to(self._device, non_blocking=True)
 
     def prefetch(self, shares: Iterator[Share]) -> Iterator[Share]:
-        """The same shares; a thread assembles their batches ahead where that takes time, for `batch` to hand out.
+        """Return the same shares; a thread assembles batches of streamed meshes ahead, for `batch` to hand out.
 
         Raises
         ------
         DatasetError
             While iterating: a shard is missing or damaged.
         """
-        if not self._slow():
-            return shares
+        if not isinstance(self._meshes, StreamedMeshes):
+            return shares  # a gather takes no longer than handing a batch from one thread to another (some 0.2 ms)
         lookahead = Lookahead(shares, self._prepare, self._steps_together)
         self._lookaheads.append(lookahead)
         return self._handed_out(lookahead)
@@ -141,13 +127,6 @@ class Bank:
             lookahead.close()
         self._meshes.close()
 
-    def _slow(self) -> bool:
-        """Whether assembling a batch takes longer than handing it from one thread to another (some 0.2 ms)."""
-        if self._device.type == "cuda":
-            return self.place != "device"
-        out_of_memory = self._layout.bytes > memory_room().free
-        return self.place == "stream" or (self.place == "mapped" and out_of_memory)
-
     def _handed_out(self, lookahead: Lookahead) -> Iterator[Share]:
         try:
             for share, batches in lookahead:
@@ -157,10 +136,13 @@ class Bank:
             lookahead.close()
 
     def _steps_together(self, share: Share) -> int:
-        """How many steps' meshes to ask for together: no more than a streamed bank holds at a time."""
-        return max(1, self._window // (3 * sum(len(triples) for triples in share)))
+        """How many steps' meshes to ask for together: no more than are held at a time."""
+        assert isinstance(self._meshes, StreamedMeshes)
+        window = min(self._meshes.slots, _TOGETHER_BYTES // (12 * self._meshes.rows))
+        return max(1, window // (3 * sum(len(triples) for triples in share)))
 
     def _prepare(self, shares: list[Share]) -> list[list[Batch]]:
+        assert isinstance(self._meshes, StreamedMeshes)
         triples = np.concatenate([triples for share in shares for triples in share])
         self._meshes.fetch(np.concatenate(self._numbers(triples)))
         prepared = [[self._assemble(triples) for triples in share] for share in shares]
@@ -193,12 +175,11 @@ def open_bank(
     *,
     device: torch.device | str = "cpu",
     cache: Cache = "auto",
-    folder: str | Path | None = None,
     sharers: int = 1,
     edge_sum: EdgeSum = "edges",
-    log: Log = _LOGGER.warning,
-) -> Bank:
-    """Decode the meshes of some identities to where there is room for them.
+    memory: int | None = None,
+) -> VertexBank:
+    """Decode the meshes of some identities to a device where it has room for them; stream them else.
 
     Parameters
     ----------
@@ -206,77 +187,34 @@ def open_bank(
         Where batches are wanted.
     cache
         As :class:`training.recipes.training.TrainingRecipe` has it.
-    folder
-        Of memory-mapped files; by default below DSFFNET_CACHE or the user's cache folder.
     sharers
         Processes of this machine that open the same bank.
     edge_sum
         Edges of a batch: every edge once, or the three sides of every face (NPT).
-    log
-        Told what a person should know: a file that had to be made again, a long wait.
+    memory
+        Bytes that streamed meshes may take; by default half of what is free, divided among the sharers.
 
     Raises
     ------
     DatasetError
         A shard is missing or damaged; there are no identities.
     RecipeError
-        ``cache`` names a place that has no room.
-    StorageError
-        ``cache`` is ``mapped`` and the file cannot be written; ``auto`` streams then.
+        ``cache`` is ``device``, which has no room.
     """
     if not len(identities):
         raise DatasetError(f"{dataset.url} has no such identities: there is nothing to train on")
     device, layout = torch.device(device), Layout(dataset, identities)
     edges = EdgeTable(dataset, identities, device=device, of=edge_sum)
-
-    def mapped() -> Path:
-        return mapped_path(layout, Path(folder) if folder else default_folder())
-
-    choice = choose(cache, layout.bytes, device=device, mapped=mapped, sharers=sharers)
-    try:
-        if choice.place != "stream":
-            held = _held(layout, choice.place, device, mapped, sharers=sharers, log=log)
-            return Bank(layout, HeldMeshes(layout, held), edges, choice, device=device)
-    except StorageError as error:
-        if cache != "auto":
-            raise
-        log(f"training meshes are streamed, not mapped: {error}")
-        choice = Choice("stream", f"streamed, {bytes_text(layout.bytes)} in all: {mapped().parent} cannot be written")
-    memory = int(_STREAM_SHARE * memory_room().free / sharers)
-    return streamed_bank(layout, edges, device=device, memory=memory, why=choice.why)
-
-
-def _held(
-    layout: Layout, place: Place, device: torch.device, mapped: Callable[[], Path], *, sharers: int, log: Log
-) -> Tensor:
-    """All vertices [vertex, 3] of a layout, in the place that was chosen for them."""
-    if place == "mapped":
-        return map_vertices(layout, mapped().parent, log=log)
-    return _decoded(layout, device if place == "device" else torch.device("cpu"), sharers=sharers)
-
-
-def streamed_bank(
-    layout: Layout, edges: EdgeTable, *, device: torch.device, memory: int, why: str = "streamed"
-) -> Bank:
-    """A bank that holds ``memory`` bytes of its meshes at a time."""
-    streamed = StreamedMeshes(layout, memory=memory)
-    choice = Choice("stream", f"{why}; {bytes_text(12 * streamed.rows * streamed.slots)} held at a time")
-    window = min(streamed.slots, _TOGETHER_BYTES // (12 * streamed.rows))
-    return Bank(layout, streamed, edges, choice, device=device, window=window)
-
-
-def _decoded(layout: Layout, device: torch.device, *, sharers: int) -> Tensor:
-    """All vertices [vertex, 3] of a layout in a device's memory."""
-    vertices = torch.empty(layout.vertices, 3, device=device)
-
-    def put(start: int, its: Floats) -> None:
-        vertices[start : start + len(its)] = torch.from_numpy(its).to(device)
-
-    decode(layout, put, sharers=sharers)
-    return vertices
+    choice = choose(cache, layout.bytes, room_of(device, sharers=sharers))
+    if choice.place == "device":
+        held = HeldMeshes(layout, decode(layout, device, sharers=sharers))
+        return VertexBank(layout, held, edges, choice, device=device)
+    streamed = StreamedMeshes(layout, memory=stream_memory(sharers=sharers) if memory is None else memory)
+    why = f"{choice.why}; {bytes_text(12 * streamed.rows * streamed.slots)} held at a time"
+    return VertexBank(layout, streamed, edges, replace(choice, why=why), device=device)
 
 
 def _pinned(batch: Batch) -> Batch:
     """The same in memory from which a GPU copies by itself; edges are there already."""
-    source, target, truth = (its.pin_memory() for its in (batch.source, batch.target, batch.truth))
-    return Batch(source, target, truth, batch.edges, batch.source_counts, batch.target_counts)
+    source, target, truth = (mesh.pin_memory() for mesh in (batch.source, batch.target, batch.truth))
+    return replace(batch, source=source, target=target, truth=truth)

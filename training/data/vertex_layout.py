@@ -1,11 +1,13 @@
 """Where the meshes of some identities lie in one array of vertices, and how they come there from a dataset."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from datagen.grid import HOLE, SPLITS, Split
 from datagen.mesh.geometry import Box, bounds
@@ -14,7 +16,7 @@ from datagen.store import Dataset
 Numbers = NDArray[np.integer]
 Floats = NDArray[np.float32]
 
-_CHUNK_BYTES = 2**25  # decoded at a time by one thread; part of the format of mapped files, see there
+_CHUNK_BYTES = 2**25  # decoded at a time by one thread
 _MOST_THREADS = 8
 
 
@@ -134,20 +136,21 @@ class Layout:
         return normalised(found if among is None else found[np.searchsorted(among, meshes)])
 
 
-def decode(layout: Layout, put: Callable[[int, Floats], None], *, sharers: int = 1) -> None:
-    """Read all meshes of a layout and hand runs of them to ``put``, in any order.
+def decode(layout: Layout, device: torch.device, *, sharers: int = 1) -> Tensor:
+    """Return all normalised vertices [vertex, 3] of a layout, in a device's memory.
 
-    ``put`` gets the place of a run's first vertex and its normalised vertices [vertex, 3]. A few threads, the machine's
-    processors being divided among ``sharers`` processes; memory is bounded.
+    A few threads read, the machine's processors being divided among ``sharers`` processes.
 
     Raises
     ------
     DatasetError
         A shard is missing or damaged.
     """
+    vertices = torch.empty(layout.vertices, 3, device=device)
 
     def one(meshes: NDArray[np.int64]) -> None:
-        put(int(layout.starts[meshes[0]]), layout.read(meshes).reshape(-1, 3))
+        start, read = int(layout.starts[meshes[0]]), layout.read(meshes).reshape(-1, 3)
+        vertices[start : start + len(read)] = torch.from_numpy(read).to(device)
 
     threads = max(1, min(_MOST_THREADS, (os.cpu_count() or 1) // sharers))
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
@@ -158,3 +161,4 @@ def decode(layout: Layout, put: Callable[[int, Floats], None], *, sharers: int =
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    return vertices

@@ -11,8 +11,7 @@ import torch
 from datagen.common.errors import RecipeError
 from datagen.common.resources import bytes_text
 from datagen.store import Dataset
-from training.data.cache_policy import device_room, memory_room
-from training.engine.distributed import Ranks
+from training.data.cache_policy import Room
 from training.inference.predict import network_from
 from training.recipes.training import NetworkRecipe, TrainingRecipe
 
@@ -24,8 +23,8 @@ _NARROW = 2_048
 """Networks of no wider layers fit anywhere; to count the parameters of others exactly takes seconds."""
 
 
-def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, device: torch.device, ranks: Ranks) -> None:
-    """Refuse a recipe whose step needs more than the memory of this rank's device.
+def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, room: Room, *, ranks: int = 1) -> None:
+    """Raise if a step of one of the ranks needs more than the room of its device.
 
     Raises
     ------
@@ -33,19 +32,18 @@ def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, device: torch.
         It does; the message names what to lower.
     """
     most = max((dataset.vertex_count(identity) for identity in dataset.identities("training")), default=0)
-    meshes = math.ceil(recipe.batch / (ranks.count * recipe.accumulate))
+    meshes = math.ceil(recipe.batch / (ranks * recipe.accumulate))
     widths = _widths(recipe.network)
-    weights = _PARAMETER * _parameters(recipe.network)
-    of_a_mesh = _ACTIVATIONS * sum(widths) * most
-    room = device_room(device) if device.type == "cuda" else memory_room()
-    sharers = 1 if device.type == "cuda" else ranks.here
-    if sharers * (weights + meshes * of_a_mesh) > room.free:
-        alone = sharers * (weights + of_a_mesh) > room.free
+    weights = room.sharers * _PARAMETER * _parameters(recipe.network)
+    of_a_mesh = room.sharers * _ACTIVATIONS * sum(widths) * most
+    needed = weights + meshes * of_a_mesh
+    if needed > room.free:
+        alone = weights + of_a_mesh > room.free
         lower = "training.network's widths" if alone else "training.batch, or raise training.accumulate"
         raise RecipeError(
-            f"a training step takes at least {bytes_text(sharers * (weights + meshes * of_a_mesh))} ({meshes:,} meshes "
-            f"of {most:,} vertices at a time, widths {', '.join(map(str, widths))}), but the {room.where} has "
-            f"{bytes_text(room.free)} free. Lower {lower}"
+            f"a training step takes at least {bytes_text(needed)} ({meshes:,} meshes of {most:,} vertices at a time, "
+            f"widths {', '.join(map(str, widths))}), but the {room.where} has {bytes_text(room.free)} free. "
+            f"Lower {lower}"
         )
 
 

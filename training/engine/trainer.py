@@ -26,8 +26,9 @@ from training.checkpoints.compat import state_of
 from training.checkpoints.state_file import unusable_state
 from training.data.augmentation import Augmentation
 from training.data.batch import Batch
+from training.data.cache_policy import room_of
 from training.data.triples import last_step_of, order_of
-from training.data.vertex_bank import Bank, open_bank
+from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import (
     BudgetSpent,
     Ranks,
@@ -143,7 +144,12 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
             if found and is_finished(found, last_step_of(recipe, dataset)):
                 return found.step
             require_measurable(dataset, recipe)
-            agreed(ranks, lambda: require_step_memory(recipe, dataset, device, ranks), what="hold a step in memory")
+            room = room_of(device, sharers=ranks.here)
+            agreed(
+                ranks,
+                lambda: require_step_memory(recipe, dataset, room, ranks=ranks.count),
+                what="hold a step in memory",
+            )
             # The trainer must be gone before its process group is: see tests/support/one_rank.py.
             return _Trainer(recipe, dataset, run, ranks, device, stop, began or now, found).run()
 
@@ -181,13 +187,12 @@ class _Trainer:
         self.stopping = self.out_of_time = False
         self._recent: list[tuple[int, Any, Any]] = []
 
-    def _opened_bank(self) -> Bank:
+    def _opened_bank(self) -> VertexBank:
         return open_bank(
             self.dataset,
             self.dataset.identities("training"),
             device=self.device,
             cache=self.recipe.cache,
-            folder=self.recipe.cache_folder,
             sharers=self.ranks.here,
             edge_sum=self.recipe.edge_sum,
         )

@@ -114,14 +114,6 @@ def transfer_loss(
     return loss, {"reconstruction": reconstruction.detach(), "edge": edge.detach()}
 
 
-def pose_transfer_loss(
-    prediction: Tensor, truth: Tensor, edges: Tensor, edge_weight: float = EDGE_WEIGHT
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the paper's loss and its parts as :func:`transfer_loss` does."""
-    recipe = PaperLoss(edge_weight=edge_weight)
-    return transfer_loss(prediction, truth=truth, target=truth, edges=edges, recipe=recipe)
-
-
 def reconstruction_loss(prediction: Tensor, truth: Tensor, counts: Sequence[int] | None = None) -> Tensor:
     """Return the mean over meshes of the mean over a mesh's vertices of ``|prediction - truth|^2``.
 

@@ -164,13 +164,10 @@ class TrainingRecipe(Frozen):
     )
     compile: bool = Field(False, description="torch.compile the network: a minute at first, then faster on a GPU")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA where there is one")
-    cache: Literal["auto", "device", "memory", "mapped", "stream"] = Field(
+    cache: Literal["auto", "device", "stream"] = Field(
         "auto",
-        description="where decoded meshes are kept: device memory, RAM, a memory-mapped file, or (stream) only the "
-        "shards in use; auto: the first of these with room",
-    )
-    cache_folder: str | None = Field(
-        None, description="folder of memory-mapped caches; default: the system's for users"
+        description="where decoded meshes are kept: device: all in the memory of the device that trains; stream: as "
+        "many as memory has room for; auto: device where they fit",
     )
     log_every: int = Field(20, ge=1, description="steps between lines of metrics.jsonl")
     evaluate_every: int = Field(500, ge=1, description="steps between PMD measurements on a fixed evaluation subset")
@@ -242,11 +239,11 @@ def _meant(value: object) -> object:
     return value.model_copy(update={"warm_up": value.rise}) if isinstance(value, ScheduleRecipe) else value
 
 
-PATH_KEYS = frozenset({"start_from", "cache_folder"})
+PATH_KEYS = frozenset({"start_from"})
 """Keys of a training recipe that name files or folders."""
 
 _HOW_IT_RUNS = {
-    "ranks", "fewest_ranks", "launcher", "device", "cache", "cache_folder", "compile", "budget", "accumulate",
+    "ranks", "fewest_ranks", "launcher", "device", "cache", "compile", "budget", "accumulate",
     "log_every", "evaluate_every", "evaluate_triples", "picture_every", "checkpoint_every", "keep_checkpoints",
     "timeout",
 }  # fmt: skip

@@ -15,8 +15,6 @@ from tests.support.commands import ROOT
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.data.cache_policy import Room
-from training.engine import step_memory
-from training.engine.distributed import Ranks
 from training.engine.step_memory import require_step_memory
 from training.engine.train_step import Learner
 from training.engine.trainer import train
@@ -25,12 +23,10 @@ from training.evaluation import measure as measuring
 from training.evaluation.evaluate import Method, evaluate
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
 
-CPU = torch.device("cpu")
 
-
-def require(dataset: str, *, ranks: int = 1, here: int = 1, **changes: Any) -> None:
-    recipe = tiny_training(**changes)
-    require_step_memory(recipe, open_dataset(dataset), CPU, Ranks(0, ranks, 0, here))
+def require(dataset: str, free: float, *, ranks: int = 1, here: int = 1, **changes: Any) -> None:
+    room = Room("memory", int(free), 0.5, sharers=here)
+    require_step_memory(tiny_training(**changes), open_dataset(dataset), room, ranks=ranks)
 
 
 @pytest.mark.parametrize(
@@ -42,32 +38,30 @@ def require(dataset: str, *, ranks: int = 1, here: int = 1, **changes: Any) -> N
     ],
     ids=str,
 )
-def test_widths_beyond_memory_are_refused_before_the_network_is_made(
-    network: dict[str, Any], dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(step_memory, "memory_room", lambda: Room("memory", 20 * 10**9, 0.5))
+def test_widths_beyond_memory_are_refused_before_the_network_is_made(network: dict[str, Any], dataset: str) -> None:
     with pytest.raises(RecipeError, match=r"the memory has 20.0 GB free. Lower training.network's widths") as raised:
-        train(tiny_training(network=network), data=dataset, run=tmp_path / "run")
+        require(dataset, 20e9, network=network)
     assert "\n" not in str(raised.value)
 
 
-def test_a_batch_beyond_memory_is_refused_unless_it_is_shared(dataset: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    meshes, channels = 16, 6 * 8
-    needed = step_memory._ACTIVATIONS * meshes * 32 * channels
-    monkeypatch.setattr(step_memory, "memory_room", lambda: Room("memory", needed - 1, 0.5))
+def test_a_training_looks_at_the_memory_that_there_is(dataset: str, tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"the memory has .* free. Lower training.network's widths"):
+        train(tiny_training(network={"encoder_widths": (8, 8, 10**12)}), data=dataset, run=tmp_path / "run")
+
+
+def test_a_batch_beyond_memory_is_refused_unless_it_is_shared(dataset: str) -> None:
+    meshes, channels, float32, held = 16, 6 * 8, 4, 3
+    free = float32 * held * meshes * 32 * channels - 1
     with pytest.raises(RecipeError, match=r"16 meshes of 32 vertices .* training.batch, or raise training.accumulate"):
-        require(dataset, batch=16)
-    require(dataset, batch=16, accumulate=2)
-    require(dataset, batch=16, ranks=2)
+        require(dataset, free, batch=16)
+    require(dataset, free, batch=16, accumulate=2)
+    require(dataset, free, batch=16, ranks=2)
     with pytest.raises(RecipeError, match="8 meshes"):
-        require(dataset, batch=16, ranks=2, here=2)  # both on this machine
+        require(dataset, free, batch=16, ranks=2, here=2)  # both on this machine
 
 
-def test_every_recipe_of_ours_has_room_in_a_gigabyte_for_a_small_mesh(
-    dataset: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(step_memory, "memory_room", lambda: Room("memory", 10**9, 0.5))
-    require_step_memory(TrainingRecipe(), open_dataset(dataset), CPU, Ranks(0, 1, 0))
+def test_every_recipe_of_ours_has_room_in_a_gigabyte_for_a_small_mesh(dataset: str) -> None:
+    require_step_memory(TrainingRecipe(), open_dataset(dataset), Room("memory", 10**9, 0.5))
 
 
 def test_memory_that_runs_out_in_a_step_is_one_error_and_the_checkpoint_stays(

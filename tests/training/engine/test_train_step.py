@@ -239,8 +239,7 @@ def test_identities_of_different_vertex_counts_train_together(tmp_path: Path) ->
     assert losses(tmp_path / "one")[-5:].mean() < losses(tmp_path / "one")[:5].mean()
 
 
-@pytest.mark.parametrize("cache", ["memory", "mapped", "stream"])
-def test_the_cache_changes_no_bit(dataset: str, tmp_path: Path, cache: str) -> None:
-    train(tiny_training(), data=dataset, run=tmp_path / "auto")
-    train(tiny_training(cache=cache, cache_folder=str(tmp_path / "cache")), data=dataset, run=tmp_path / cache)
-    assert same_bits(tmp_path / cache, tmp_path / "auto")
+def test_the_cache_changes_no_bit(dataset: str, tmp_path: Path) -> None:
+    for cache in ("device", "stream"):
+        train(tiny_training(cache=cache), data=dataset, run=tmp_path / cache)
+    assert same_bits(tmp_path / "device", tmp_path / "stream")

@@ -15,7 +15,6 @@ from training.objectives.losses import (
     PaperLoss,
     edge_length_loss,
     loss_edges,
-    pose_transfer_loss,
     reconstruction_loss,
     transfer_loss,
 )
@@ -223,12 +222,13 @@ def test_a_prediction_that_is_not_a_number_is_not_hidden() -> None:
 
 def test_total_and_its_parts() -> None:
     prediction, truth = _pair()
-    total, parts = pose_transfer_loss(prediction.requires_grad_(), truth, EDGES)
+    total, parts = transfer_loss(prediction.requires_grad_(), truth=truth, target=truth, edges=EDGES)
     rebuilt = parts["reconstruction"] + 0.0005 * parts["edge"]
     assert total.item() == pytest.approx(rebuilt.item(), rel=1e-12)
     assert parts["edge"].item() == pytest.approx(_literal_edge_loss(prediction, truth).item(), rel=1e-12)
     assert total.requires_grad and not any(part.requires_grad for part in parts.values())
-    without, _ = pose_transfer_loss(prediction, truth, EDGES, edge_weight=0.0)
+    recipe = PaperLoss(edge_weight=0.0)
+    without, _ = transfer_loss(prediction, truth=truth, target=truth, edges=EDGES, recipe=recipe)
     assert without.item() == parts["reconstruction"].item()
 
 
