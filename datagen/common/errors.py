@@ -120,6 +120,12 @@ class TrainingStopped(TrainingError):
     exit_status = 143
 
 
+class BudgetSpent(TrainingStopped):
+    """The time that one command may take is used up; a checkpoint was written. 75 asks a script to try again."""
+
+    exit_status = 75
+
+
 class TrackingError(DsffnetError):
     """The tracking server cannot be reached, or refuses; nothing is lost, it can be sent later."""
 

@@ -115,11 +115,11 @@ def _resume(tree: Path) -> None:
 
 def _state_of_run(tree: Path) -> None:
     from training.checkpoints.checkpoint import require_checkpoint
-    from training.checkpoints.compat import recipe_of, state_of
+    from training.checkpoints.compat import recipe_of
 
     checkpoint = require_checkpoint(tree)
     recipe_of(checkpoint)
-    state_of(checkpoint, averaged=True)
+    checkpoint.state()
 
 
 def _learned(tree: Path) -> None:

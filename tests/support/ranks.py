@@ -1,9 +1,11 @@
 """Ranks as processes of their own over gloo, as torchrun would start them, with a bound on how long they may take."""
 
+import json
 import os
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
@@ -27,12 +29,15 @@ def start_ranks(
     run: Path,
     count: int,
     module: str = "training",
-    log: Path | None = None,
 ) -> list[subprocess.Popen[str]]:
     """Start ``count`` ranks of ``python -m module RECIPE DATA RUN``."""
     run.parent.mkdir(parents=True, exist_ok=True)
     path = run.parent / f"{run.name}-recipe.yaml"
     path.write_text(yaml.safe_dump(recipe.model_dump(mode="json")))
+    return _started([sys.executable, "-m", module, str(path), data, str(run)], count)
+
+
+def _started(command: Sequence[str], count: int) -> list[subprocess.Popen[str]]:
     shared = {
         "WORLD_SIZE": str(count),
         "MASTER_ADDR": "127.0.0.1",
@@ -41,7 +46,7 @@ def start_ranks(
     }
     return [
         subprocess.Popen(
-            [sys.executable, "-m", module, str(path), data, str(run)],
+            command,
             cwd=ROOT,
             env={**os.environ, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
             stdout=subprocess.PIPE,
@@ -52,6 +57,14 @@ def start_ranks(
     ]
 
 
+def train_in_turn(jobs: Sequence[tuple[TrainingRecipe, Path]], *, data: str, place: Path, count: int = 2) -> None:
+    """Train every (recipe, run) by one group of ranks, one after the other; starting a group takes seconds."""
+    path = place / "jobs.json"
+    path.write_text(json.dumps([[recipe.model_dump(mode="json"), data, str(run)] for recipe, run in jobs]))
+    results = finish(_started([sys.executable, "-m", "tests.support.ranks", str(path)], count))
+    assert [status for status, _ in results] == [0] * count, results
+
+
 def finish(ranks: list[subprocess.Popen[str]], *, timeout: float = 120) -> list[tuple[int, str]]:
     """Exit status and output of each rank; all are killed if one hangs."""
     try:
@@ -60,3 +73,15 @@ def finish(ranks: list[subprocess.Popen[str]], *, timeout: float = 120) -> list[
         for process in ranks:
             process.kill()
             process.wait()
+
+
+if __name__ == "__main__":
+    import torch.distributed
+
+    from training.engine.trainer import train
+
+    torch.distributed.init_process_group("gloo")
+    for values, data, run in json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")):
+        train(TrainingRecipe.model_validate(values), data=data, run=Path(run))
+    torch.distributed.barrier()
+    os._exit(0)

@@ -65,8 +65,8 @@ class Checkpoint:
     """One sound checkpoint: its folder (or file of weights), the step, and what it was trained by, on and with.
 
     ``dataset`` is the dataset's uuid, ``dataset_sha256`` the sha256 of its manifest ("" where it was not noted).
-    ``finished``: training had come to its end there, by its steps or by early stopping; ``earlier``: a version that did
-    not note this wrote it (see :func:`is_finished`). ``last_step``: the last that its recipe asked for, where noted.
+    ``finished``: training had come to its end there, by its steps or by early stopping. ``last_step``: the last that
+    its recipe asked for, where noted.
     """
 
     path: Path
@@ -77,7 +77,6 @@ class Checkpoint:
     versions: dict[str, str] = field(default_factory=dict)
     best: bool = False
     finished: bool = False
-    earlier: bool = False
     last_step: int | None = None
 
     def weights(self, *, average: bool = False) -> dict[str, Tensor]:
@@ -198,7 +197,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def is_finished(checkpoint: Checkpoint, last_step: int) -> bool:
-    """Whether training had come to its end there, for checkpoints of earlier versions too."""
+    """Whether training had come to its end there, or to a step."""
     return checkpoint.finished or checkpoint.step >= last_step
 
 
@@ -266,6 +265,5 @@ def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
         versions=about.get("versions", {}),
         best=about.get("best", False),
         finished=about.get("finished", False),
-        earlier="finished" not in about,
         last_step=about.get("last_step"),
     )

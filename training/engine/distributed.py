@@ -17,7 +17,7 @@ import torch.distributed as dist
 from filelock import Timeout
 from torch import Tensor
 
-from datagen.common.errors import StorageError, TrainingError, TrainingStopped
+from datagen.common.errors import StorageError, TrainingError
 from datagen.common.files import lock_within
 from training.recipes.training import TrainingRecipe
 
@@ -26,12 +26,6 @@ STOP_FILE = "stop"
 LOCK_SECONDS = float(
     os.environ.get("DSFFNET_LOCK_SECONDS", "30")
 )  # how long to wait for the ranks of a killed driver to be gone
-
-
-class BudgetSpent(TrainingStopped):
-    """The time that one command may take is used up; a checkpoint was written. 75 asks a script to try again."""
-
-    exit_status = 75
 
 
 @dataclass(frozen=True)
@@ -226,16 +220,12 @@ class StopRequest:
         return self._signalled.is_set()
 
 
-def random_states(ranks: int = 1) -> list[dict[str, Tensor]]:
-    """Torch's random states (CPU, and CUDA where it is in use) of every rank; all ranks must call this together."""
-    own = {"cpu": torch.get_rng_state()}
+def random_state() -> dict[str, Tensor]:
+    """Return torch's random states of this process: CPU, and CUDA where it is in use."""
+    state = {"cpu": torch.get_rng_state()}
     if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
-        own["cuda"] = torch.cuda.get_rng_state()
-    if ranks == 1:
-        return [own]
-    states: list[Any] = [None] * ranks
-    dist.all_gather_object(states, own)
-    return states
+        state["cuda"] = torch.cuda.get_rng_state()
+    return state
 
 
 def restore_random_state(states: Sequence[Mapping[str, Tensor]], rank: int) -> None:

@@ -57,10 +57,11 @@ def launch(recipe: TrainingRecipe, *, data: str, run: Path) -> None:
 
 
 def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
-    began, gpu = time.time(), _on_gpus(recipe)
+    began, gpu = time.time(), on_gpus(recipe)
     if not gpu:
         recipe = recipe.model_copy(update={"device": "cpu"})
-    _require(recipe, "GPU" if gpu else "CPU")
+    resource = "GPU" if gpu else "CPU"
+    require_enough(recipe, _count(resource), resource)
     fewest = f"{recipe.fewest_ranks} to " if recipe.fewest_ranks else ""
     _say(f"{fewest}{recipe.ranks} ranks by Ray", "one GPU each (NCCL)" if gpu else "CPUs (Gloo)")
     run.mkdir(parents=True, exist_ok=True)
@@ -71,14 +72,14 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     told = {"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark, "began": began}
     try:
         with _passing_on_sigterm(run):
-            _fit(_group(recipe, told, gpu=gpu).fit, run)
+            fit_while_progressing(_group(recipe, told, gpu=gpu).fit, run)
     except DsffnetError:
         raise
     except Exception as error:
         raise _failure_of(run) or TrainingError(
             f"the training ranks died {_RESTARTS + 1} times without a new checkpoint; the last reason: "
             f"{(str(error).strip().splitlines() or [type(error).__name__])[-1]}. "
-            "Run the same command again to go on from the newest checkpoint"
+            "Run the same command again to resume from the newest checkpoint"
         ) from error
     failure = _failure_of(run)
     if failure:
@@ -96,7 +97,7 @@ def _group(recipe: TrainingRecipe, told: dict[str, Any], *, gpu: bool) -> Any:
 
     storage = str(Path(told["run"]).resolve())
     return Trainer(
-        _rank,
+        train_rank,
         train_loop_config=told,
         torch_config=TorchConfig(backend="nccl" if gpu else "gloo", timeout_s=recipe.timeout),
         scaling_config=ScalingConfig(num_workers=_workers(recipe), use_gpu=gpu),
@@ -104,9 +105,10 @@ def _group(recipe: TrainingRecipe, told: dict[str, Any], *, gpu: bool) -> Any:
     )
 
 
-def _fit(fit: Callable[[], object], run: Path) -> None:
-    """Have Ray train, anew whenever its restarts are used up and a checkpoint came of them: a training of days may
-    lose more nodes than one that gets nowhere should be restarted.
+def fit_while_progressing(fit: Callable[[], object], run: Path) -> None:
+    """Have Ray train, anew whenever its restarts are used up and a checkpoint came of them.
+
+    A training of days may lose more nodes than one that gets nowhere should be restarted.
     """
     while True:
         before = _newest(run)
@@ -134,9 +136,11 @@ def _workers(recipe: TrainingRecipe) -> int | tuple[int, int]:
     return (recipe.fewest_ranks, recipe.ranks) if recipe.fewest_ranks else recipe.ranks
 
 
-def _rank(config: dict[str, Any]) -> None:
-    """One rank. What a person must mend is handed to the driver as a file; raising then takes the other ranks down,
-    and the group that Ray starts again sees the file and ends at once.
+def train_rank(config: dict[str, Any]) -> None:
+    """Train as one rank of Ray's.
+
+    What a person must repair is handed to the driver as a file; raising then takes the other ranks down, and the group
+    that Ray starts again sees the file and ends at once.
     """
     run = Path(config["run"])
     if (run / _FAILURE).exists():
@@ -189,11 +193,17 @@ def _passing_on_sigterm(run: Path) -> Iterator[None]:
         (run / STOP_FILE).unlink(missing_ok=True)
 
 
-def _on_gpus(recipe: TrainingRecipe) -> bool:
-    """Whether the ranks get GPUs: if asked for, or if the cluster has enough of them and its torch can use them."""
+def on_gpus(
+    recipe: TrainingRecipe, gpus: Callable[[], int] | None = None, usable: Callable[[], bool] | None = None
+) -> bool:
+    """Return whether the ranks get GPUs: if asked for, or if the cluster has enough that its torch can use.
+
+    ``gpus`` and ``usable`` tell of a cluster; by default of the one that Ray is connected to.
+    """
     if recipe.device != "auto":
         return recipe.device == "cuda"
-    return _cluster("GPU") >= (recipe.fewest_ranks or recipe.ranks) and _torch_there_uses_gpus()
+    count = gpus() if gpus else _count("GPU")
+    return count >= (recipe.fewest_ranks or recipe.ranks) and (usable or _torch_there_uses_gpus)()
 
 
 def _torch_there_uses_gpus() -> bool:
@@ -212,15 +222,22 @@ def _sees_cuda() -> bool:
     return torch.cuda.is_available()
 
 
-def _cluster(resource: str) -> int:
+def _count(resource: str) -> int:
     import ray
 
     return int(ray.cluster_resources().get(resource, 0))
 
 
-def _require(recipe: TrainingRecipe, resource: str) -> None:
+def require_enough(recipe: TrainingRecipe, available: int, resource: str) -> None:
+    """Raise if a cluster has fewer CPUs or GPUs than the recipe has ranks.
+
+    Raises
+    ------
+    TrainingError
+        It has; the message names the key to change.
+    """
     key = "fewest_ranks" if recipe.fewest_ranks else "ranks"
-    wanted, available = getattr(recipe, key), _cluster(resource)
+    wanted = getattr(recipe, key)
     if available < wanted:
         raise TrainingError(
             f"training.{key} is {wanted}, but the cluster has {available} {resource}s. "

@@ -16,6 +16,8 @@ from training.engine.distributed import Ranks, gathered
 
 log = logging.getLogger(__name__)
 NOT_FINITE = "not-finite.json"
+RecentStep = tuple[int, Any, Any]
+"""A step, its parts of triples, its loss."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class Broken:
     triples: list[list[int]]
 
 
-def broken_step(bad_step: int, recent: Sequence[tuple[int, Any, Any]], rank: int) -> Broken:
-    """What was wrong at a step, of the latest ones: (step, parts of triples, loss) each."""
+def broken_step(bad_step: int, recent: Sequence[RecentStep], rank: int) -> Broken:
+    """What was wrong at a step, of the latest ones."""
     for step, parts, loss in recent:
         if step == bad_step:
             finite = bool(torch.isfinite(torch.as_tensor(loss)))
@@ -50,10 +52,10 @@ def stop_for(mine: Broken, run: Path, ranks: Ranks) -> None:
     TrainingError
         Always; ``secondary`` on ranks that another one tells for.
     """
-    everyone = [its for its in gathered(mine, ranks) if its.step]
-    step = min(its.step for its in everyone)
-    at_fault = [its for its in everyone if its.step == step]
-    culprits = [its for its in at_fault if its.what == "loss"] or at_fault
+    everyone = [each for each in gathered(mine, ranks) if each.step]
+    step = min(each.step for each in everyone)
+    at_fault = [each for each in everyone if each.step == step]
+    culprits = [each for each in at_fault if each.what == "loss"] or at_fault
     kept = _written(run, step, culprits) if ranks.rank == 0 else f" (see {run / NOT_FINITE})"
     here = mine in culprits
     where = f"this rank's triples were {mine.triples}" if here else "on another rank"
@@ -68,7 +70,7 @@ def stop_for(mine: Broken, run: Path, ranks: Ranks) -> None:
 
 def _written(run: Path, step: int, culprits: list[Broken]) -> str:
     """Write RUN/not-finite.json; where that fails too, it is a warning beside the error."""
-    about = {"step": step, "what": culprits[0].what, "ranks": [asdict(its) for its in culprits]}
+    about = {"step": step, "what": culprits[0].what, "ranks": [asdict(each) for each in culprits]}
     try:
         write_atomically(run / NOT_FINITE, json.dumps(about, indent=1).encode())
     except StorageError as error:

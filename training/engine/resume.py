@@ -5,37 +5,70 @@ Rank 0 chooses, so that all ranks begin from the same one; before anything large
 
 from pathlib import Path
 
-from datagen.common.errors import CheckpointError
+import torch
+
+from datagen.common.errors import CheckpointError, reason_of
 from datagen.store import Dataset
 from training.checkpoints.checkpoint import Checkpoint, load_checkpoint, read_checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
-from training.engine.distributed import Ranks, agreed, decided_by_first
+from training.checkpoints.state_file import unusable_state
+from training.engine.distributed import Ranks, agreed, decided_by_first, restore_random_state
+from training.engine.state import Job, State, Verdict
+from training.engine.train_step import Learner
 from training.recipes.training import TrainingRecipe
 
 
-def checkpoint_to_go_on_from(recipe: TrainingRecipe, dataset: Dataset, run: Path, ranks: Ranks) -> Checkpoint | None:
-    """The newest sound checkpoint of a run, of this recipe and dataset; None where the run has none.
+def begin(job: Job, device: torch.device, newest: Checkpoint | None) -> State:
+    """Return the state of the newest checkpoint; without one, that of a training which begins.
+
+    Raises
+    ------
+    CheckpointError
+        On every rank, if one cannot use the checkpoint, or the weights that ``recipe.start_from`` names.
+    """
+    start = None if newest else weights_to_begin_from(job.recipe, job.ranks)
+    spanned = {"steps_per_epoch": job.order.steps_per_epoch, "steps": job.last_step}
+    learner = Learner(job.recipe, job.ranks, device, start=start, **spanned)
+    state = State(learner, Verdict(triples=job.recipe.evaluate_triples))
+    if newest:
+        agreed(job.ranks, lambda: _resume(state, newest, job), what="resume from the newest checkpoint")
+    return state
+
+
+def _resume(state: State, newest: Checkpoint, job: Job) -> None:
+    saved = newest.state()
+    try:
+        state.learner.load(newest, saved)
+        restore_random_state(saved["random"], job.ranks.rank)
+        state.verdict = Verdict.resumed(saved["verdict"], triples=job.recipe.evaluate_triples)
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise unusable_state(newest.path, f"{type(error).__name__}: {reason_of(error)}") from error
+    state.step = newest.step
+
+
+def checkpoint_to_resume(recipe: TrainingRecipe, dataset: Dataset, run: Path, ranks: Ranks) -> Checkpoint | None:
+    """Return the newest sound checkpoint of a run, of this recipe and dataset; None where the run has none.
 
     Raises
     ------
     CheckpointError, RecipeError
-        The run learned on another dataset or by another recipe.
+        The run was trained on another dataset or by another recipe.
     """
 
     def newest() -> str | None:
-        found = load_checkpoint(run)
-        return str(found.path) if found else None
+        checkpoint = load_checkpoint(run)
+        return str(checkpoint.path) if checkpoint else None
 
     path = decided_by_first(ranks, newest)
     if path is None:
         return None
 
     def read() -> Checkpoint:
-        found = read_checkpoint(Path(path))
-        _require_same(recipe, dataset, run, found)
-        return found
+        checkpoint = read_checkpoint(Path(path))
+        require_same_training(recipe, dataset, run, checkpoint)
+        return checkpoint
 
-    return agreed(ranks, read, what="go on from the newest checkpoint")
+    return agreed(ranks, read, what="resume from the newest checkpoint")
 
 
 def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | None:
@@ -53,10 +86,17 @@ def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | 
     return agreed(ranks, lambda: require_checkpoint(path), what="read the weights of training.start_from")
 
 
-def _require_same(recipe: TrainingRecipe, dataset: Dataset, run: Path, found: Checkpoint) -> None:
-    if found.dataset != dataset.uuid:
+def require_same_training(recipe: TrainingRecipe, dataset: Dataset, run: Path, checkpoint: Checkpoint) -> None:
+    """Raise if a run's checkpoint was trained by another recipe or on another dataset.
+
+    Raises
+    ------
+    CheckpointError, RecipeError
+        It was; the message says what differs.
+    """
+    if checkpoint.dataset != dataset.uuid:
         raise CheckpointError(
-            f"{run} was trained on dataset {found.dataset}, not on {dataset.url} ({dataset.uuid}). Choose another "
+            f"{run} was trained on dataset {checkpoint.dataset}, not on {dataset.url} ({dataset.uuid}). Choose another "
             f"--out (begin there from these weights with --set training.start_from={run}), or add --fresh to start over"
         )
-    recipe.require_same_learning(recipe_of(found), where=str(run))
+    recipe.require_same_learning(recipe_of(checkpoint), where=str(run))

@@ -12,7 +12,7 @@ from datagen.common.errors import RecipeError
 from datagen.common.resources import bytes_text
 from datagen.store import Dataset
 from training.data.cache_policy import Room
-from training.inference.predict import network_from
+from training.networks import network_from
 from training.recipes.training import NetworkRecipe, TrainingRecipe
 
 _PARAMETER = 16

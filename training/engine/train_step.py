@@ -11,7 +11,7 @@ without a checkpoint, so that this average is neither kept nor evaluated.)
 import contextlib
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -23,9 +23,9 @@ from training.data.augmentation import Shuffle
 from training.data.batch import Batch
 from training.engine.distributed import Ranks
 from training.engine.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
-from training.inference.predict import load_weights, network_from
+from training.inference.predict import load_weights
+from training.networks import network_from
 from training.networks.execution import autocast, compiled, products
-from training.networks.layers.elain import iterated_once
 from training.networks.padded_batches import MixedCounts
 from training.objectives.losses import transfer_loss
 from training.recipes.training import TrainingRecipe
@@ -58,7 +58,7 @@ class Learner:
         steps: int,
         start: Checkpoint | None = None,
     ) -> None:
-        self.recipe, self._ranks, self._device = recipe, ranks, device
+        self.recipe, self._ranks, self.device = recipe, ranks, device
         self.dtype = torch.float64 if recipe.precision == "float64" else torch.float32
         torch.manual_seed(recipe.seed)
         network = network_from(recipe.network)
@@ -77,17 +77,22 @@ class Learner:
         """
         self.optimiser.zero_grad(set_to_none=True)
         meshes = sum(len(part.source) for part in parts)
-        found: dict[str, Tensor] = {}
-        with products(self.recipe.precision), iterated_once(self.network):
+        losses: dict[str, Tensor] = {}
+        with products(self.recipe.precision), self._accumulation():
             for number, part in enumerate(parts):
                 weight = share * len(part.source) / meshes
                 for name, value in self._backward(part, weight, last=number == len(parts) - 1).items():
-                    found[name] = found[name] + value * weight if number else value * weight
+                    losses[name] = losses[name] + value * weight if number else value * weight
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))
         rate = self.schedule.get_last_lr()[0]
-        self._apply(norm, found["total"])
-        values: dict[str, Tensor | float] = {f"loss/{name}": value for name, value in found.items()}
+        self._apply(norm, losses["total"])
+        values: dict[str, Tensor | float] = {f"loss/{name}": value for name, value in losses.items()}
         return values | {"gradient_norm": norm, "learning_rate": rate}
+
+    def _accumulation(self) -> contextlib.AbstractContextManager[Any]:
+        """While the parts of a step run: what the network keeps the same over them, see `training.networks`."""
+        accumulation = getattr(self.network, "accumulation", contextlib.nullcontext)
+        return cast(contextlib.AbstractContextManager[Any], accumulation())
 
     @property
     def bad_step(self) -> int:
@@ -103,18 +108,18 @@ class Learner:
         state: dict[str, Any] = {"optimiser": self.optimiser.state_dict(), "schedule": self.schedule.state_dict()}
         return state | ({"averaged": self.average.state_dict()["updates"]} if self.average else {})
 
-    def load(self, found: Checkpoint, state: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint and its state."""
-        fill_network(self.network, found.weights(), where=str(found.path))
+    def load(self, checkpoint: Checkpoint, state: Mapping[str, Any]) -> None:
+        """Resume from a checkpoint and its state."""
+        fill_network(self.network, checkpoint.weights(), where=str(checkpoint.path))
         load_optimiser(self.optimiser, state["optimiser"])
         self.schedule.load_state_dict(state["schedule"])
         if self.average:
-            self.average.load_state_dict({"updates": state["averaged"], "weights": found.weights(average=True)})
+            self.average.load_state_dict({"updates": state["averaged"], "weights": checkpoint.weights(average=True)})
 
     def _backward(self, batch: Batch, weight: float, *, last: bool) -> dict[str, Tensor]:
         batch = batch.in_dtype(self.dtype)
         with self._in_step_with_others(last):
-            with autocast(self.recipe.precision, self._device):
+            with autocast(self.recipe.precision, self.device):
                 prediction = self._predict(batch)
             loss, parts = transfer_loss(
                 prediction,
@@ -144,7 +149,7 @@ class Learner:
 
         Made at the first step, after a checkpoint was loaded.
         """
-        model = MixedCounts(compiled(self.network, self._device) if self.recipe.compile else self.network)
+        model = MixedCounts(compiled(self.network, self.device) if self.recipe.compile else self.network)
         return DistributedDataParallel(model) if self._ranks.count > 1 else model
 
     def _in_step_with_others(self, last: bool) -> contextlib.AbstractContextManager[Any]:

@@ -1,36 +1,31 @@
 """The training loop, the same under any launcher; reads only RANK, WORLD_SIZE, LOCAL_RANK, MASTER_*.
 
-Read top to bottom: ``train`` -> ``_Trainer.run`` -> ``_Trainer._step``, then :mod:`training.engine.train_step`.
-Everything that
-varies is in the recipe; the order of triples is a function of (seed, step), so the state of a run is its weights, its
-optimiser, the average of its weights and a few numbers.
+Read top to bottom: ``train`` -> ``_learn``, the loop -> ``_check``, ``_settle``, ``_save``; a step itself is in
+:mod:`training.engine.train_step`. Everything that varies is in the recipe; the order of triples is a function of (seed,
+step), so the state of a run is its weights, its optimiser, the average of its weights and a few numbers.
 """
 
 import contextlib
-import json
-import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.distributed as dist
 
-from datagen.common.errors import TrainingStopped, reason_of
-from datagen.common.files import write_atomically
+from datagen.common.errors import BudgetSpent, TrainingStopped
 from datagen.common.resources import memory_errors
-from datagen.store import Dataset, open_dataset
+from datagen.store import open_dataset
 from training.checkpoints.checkpoint import Checkpoint, is_finished, save_checkpoint
-from training.checkpoints.compat import state_of
-from training.checkpoints.state_file import unusable_state
 from training.data.augmentation import Augmentation
 from training.data.batch import Batch
 from training.data.cache_policy import room_of
-from training.data.triples import last_step_of, order_of
+from training.data.triples import Triples, last_step_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import (
-    BudgetSpent,
     Ranks,
     StopRequest,
     agreed,
@@ -39,66 +34,57 @@ from training.engine.distributed import (
     decided_by_first,
     device_of,
     forget_old_stop,
+    gathered,
     mean_over_ranks,
     process_group,
-    random_states,
-    restore_random_state,
+    random_state,
 )
-from training.engine.nonfinite import broken_step, stop_for
-from training.engine.resume import checkpoint_to_go_on_from, weights_to_begin_from
-from training.engine.snapshots import snapshot_path
+from training.engine.nonfinite import RecentStep, broken_step, stop_for
+from training.engine.resume import begin, checkpoint_to_resume
+from training.engine.state import Job, State
 from training.engine.step_memory import require_step_memory
-from training.engine.train_step import Learner
-from training.engine.validation import Probe, Verdict, require_measurable
+from training.engine.validation import Meter, Observer, observing, require_measurable
 from training.recipes.training import TrainingRecipe, budget_seconds
-from training.tracking.journal import Journal
-from training.tracking.progress import Progress
-from training.tracking.system_metrics import sampling
 
-
-class Meter:
-    """Counts steps since the last reading.
-
-    Parameters
-    ----------
-    batch
-        Triples in a step, over all ranks.
-    """
-
-    def __init__(self, batch: int) -> None:
-        self._batch = batch
-        self._reset()
-
-    @contextlib.contextmanager
-    def waiting(self) -> Iterator[None]:
-        """Around whatever brings the next batch."""
-        began = time.perf_counter()
-        yield
-        self._waited += time.perf_counter() - began
-        self._steps += 1
-
-    def read(self) -> dict[str, float]:
-        """Return ``meshes_per_second`` and ``input_wait`` (a share of the time) since the last reading."""
-        seconds = time.perf_counter() - self._began
-        found = {"meshes_per_second": self._steps * self._batch / seconds, "input_wait": self._waited / seconds}
-        self._reset()
-        return found
-
-    def _reset(self) -> None:
-        self._began, self._waited, self._steps = time.perf_counter(), 0.0, 0
-
-
-log = logging.getLogger(__name__)
-_CHECK_EVERY = {"cpu": 1, "cuda": 16}
+CHECK_EVERY = {"cpu": 1, "cuda": 16}
 """Steps between looks at whether all is finite and nobody asked to stop. On a GPU each look waits for its queue."""
-_SAY_EVERY = 20.0
-"""Seconds between lines of the log."""
-
-
 _LESS_MEMORY = (
     "The last checkpoint is kept. Lower training.batch (it is {0.batch}), raise training.accumulate (it is "
     "{0.accumulate}), or lower the network's widths or the vertices"
 )
+
+
+class StopReason(Enum):
+    """Why a training ends before its last step."""
+
+    EARLY_STOPPING = "no better PMD for as many evaluations as the recipe says: the training is finished"
+    TOLD = "SIGTERM, or the file RUN/stop"
+    BUDGET = "the time budget of this command is spent"
+
+
+@dataclass(frozen=True)
+class Due:
+    """What a training owes after a step."""
+
+    check: bool
+    """To exchange between ranks whether all is finite and nobody asked to stop."""
+    log: bool
+    validate: bool
+    picture: bool
+    checkpoint: bool
+
+    @classmethod
+    def after(cls, step: int, recipe: TrainingRecipe, *, last_step: int, check_every: int = 1) -> "Due":
+        """Return what is due after ``step`` steps, the same on every rank; at the last step all but a picture is."""
+
+        def every(interval: int | None) -> bool:
+            return interval is not None and step % interval == 0
+
+        validate = step == last_step or every(recipe.evaluate_every)
+        logs = validate or every(recipe.log_every)
+        checkpoint = step == last_step or every(recipe.checkpoint_every)
+        check = logs or checkpoint or every(check_every)
+        return cls(check, logs, validate, picture=every(recipe.picture_every), checkpoint=checkpoint)
 
 
 def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None = None) -> int:
@@ -140,9 +126,9 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
             forget_old_stop(run, ranks, before=now)
         with StopRequest(run) as stop:
             dataset = agreed(ranks, lambda: open_dataset(data), what="open the dataset")
-            found = checkpoint_to_go_on_from(recipe, dataset, run, ranks)
-            if found and is_finished(found, last_step_of(recipe, dataset)):
-                return found.step
+            newest = checkpoint_to_resume(recipe, dataset, run, ranks)
+            if newest and is_finished(newest, last_step_of(recipe, dataset)):
+                return newest.step
             require_measurable(dataset, recipe)
             room = room_of(device, sharers=ranks.here)
             agreed(
@@ -150,207 +136,128 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
                 lambda: require_step_memory(recipe, dataset, room, ranks=ranks.count),
                 what="hold a step in memory",
             )
-            # The trainer must be gone before its process group is: see tests/support/one_rank.py.
-            return _Trainer(recipe, dataset, run, ranks, device, stop, began or now, found).run()
+            # What learns must be gone before its process group is: see tests/support/one_rank.py.
+            return _learn(Job(recipe, dataset, run, ranks), device, stop, newest, _deadline(recipe, began or now))
 
 
-class _Trainer:
-    def __init__(
-        self,
-        recipe: TrainingRecipe,
-        dataset: Dataset,
-        run: Path,
-        ranks: Ranks,
-        device: torch.device,
-        stop: StopRequest,
-        began: float,
-        found: Checkpoint | None,
-    ) -> None:
-        self.recipe, self.dataset, self.folder, self.ranks = recipe, dataset, run, ranks
-        self.device, self._stop = device, stop
-        self._began = time.monotonic() - max(
-            time.time() - began, 0.0
-        )  # clocks are put back, and differ between machines
-        self.order, self.last_step = order_of(recipe, dataset), last_step_of(recipe, dataset)
-        start = None if found else weights_to_begin_from(recipe, ranks)
-        self.learner = Learner(
-            recipe, ranks, device, steps_per_epoch=self.order.steps_per_epoch, steps=self.last_step, start=start
+def _deadline(recipe: TrainingRecipe, began: float) -> float:
+    """By the monotonic clock: others are put back, and differ between machines."""
+    left = budget_seconds(recipe.budget) if recipe.budget else float("inf")
+    return time.monotonic() + left - max(time.time() - began, 0.0)
+
+
+def _learn(job: Job, device: torch.device, stop: StopRequest, newest: Checkpoint | None, deadline: float) -> int:
+    """Take steps until the last one or until there is a reason to stop; return the step reached."""
+    ranks, share = job.ranks, job.order.share(rank=job.ranks.rank, ranks=job.ranks.count)
+    state, meter = begin(job, device, newest), Meter(job.recipe.batch)
+    recent: list[RecentStep] = []
+    with contextlib.ExitStack() as around:
+        bank = agreed(ranks, lambda: _opened_bank(job, device), what="open the training meshes")
+        around.callback(bank.close)
+        observer = agreed(
+            ranks,
+            lambda: around.enter_context(observing(job, state.learner, meter, bank.where)) if ranks.rank == 0 else None,
+            what="open the run's journal and evaluation triples",
         )
-        self.done, self.verdict, self.finished = 0, Verdict(triples=recipe.evaluate_triples), False
-        if found:
-            agreed(ranks, lambda: self._go_on_from(found), what="go on from the newest checkpoint")
-        self.bank = agreed(ranks, self._opened_bank, what="open the training meshes")
-        self.meter = Meter(recipe.batch)
-        self.progress = Progress(steps=self.last_step, steps_per_epoch=self.order.steps_per_epoch)
-        self._said = time.monotonic()
-        self.is_writer = ranks.rank == 0
-        self.stopping = self.out_of_time = False
-        self._recent: list[tuple[int, Any, Any]] = []
+        (told,) = any_rank([stop.made()], ranks)  # while meshes were decoded
+        reason = StopReason.TOLD if told else None
+        batches = _batches(job, bank, state.step)
+        while state.step < job.last_step and reason is None:
+            with meter.waiting():
+                triples, parts = next(batches)
+            values = state.learner.step(parts, share=share)
+            state.step += 1
+            recent.append((state.step, triples, values["loss/total"]))
+            due = Due.after(state.step, job.recipe, last_step=job.last_step, check_every=CHECK_EVERY[device.type])
+            if due.check:
+                reason = _check(job, state, recent, told=stop.made(), late=time.monotonic() > deadline)
+                recent.clear()
+            reason = _settle(job, state, observer, due, values, reason)
+    if state.step < job.last_step and reason is not StopReason.EARLY_STOPPING:
+        raise _stopped(job, state.step, reason)
+    return state.step
 
-    def _opened_bank(self) -> VertexBank:
-        return open_bank(
-            self.dataset,
-            self.dataset.identities("training"),
-            device=self.device,
-            cache=self.recipe.cache,
-            sharers=self.ranks.here,
-            edge_sum=self.recipe.edge_sum,
+
+def _check(job: Job, state: State, recent: Sequence[RecentStep], *, told: bool, late: bool) -> StopReason | None:
+    """Exchange between the ranks whether a gradient was not finite, and whether one was told to stop or has no time."""
+    bad_step = state.learner.bad_step
+    any_bad, any_told, any_late = any_rank([bad_step > 0, told, late], job.ranks)
+    if any_bad:
+        stop_for(broken_step(bad_step, recent, job.ranks.rank), job.run, job.ranks)
+    if any_told:
+        return StopReason.TOLD
+    return StopReason.BUDGET if any_late else None
+
+
+def _settle(
+    job: Job, state: State, observer: Observer | None, due: Due, values: dict[str, Any], reason: StopReason | None
+) -> StopReason | None:
+    """Do what is due after a step; return the reason to stop, which may be early stopping now."""
+    if due.log:
+        shared = mean_over_ranks(values, job.ranks)
+        pmd = decided_by_first(
+            job.ranks, lambda: observer.log(state, shared, validate=due.validate) if observer else None
         )
+        if pmd is not None:
+            state.verdict = state.verdict.after(pmd)
+            reason = StopReason.EARLY_STOPPING if state.verdict.gives_up(job.recipe.early_stopping) else reason
+    if due.picture and observer:
+        observer.draw(state, job.run)
+    improved = due.validate and state.verdict.improved
+    if due.checkpoint or improved or reason:
+        finished = state.step == job.last_step or reason is StopReason.EARLY_STOPPING
+        _save(job, state, observer, finished=finished, best=improved)
+    return reason
 
-    def run(self) -> int:
-        with contextlib.ExitStack() as around:
-            around.callback(self.bank.close)
-            agreed(self.ranks, lambda: self._watch(around), what="open the run's journal and evaluation triples")
-            (self.stopping,) = any_rank([self._stop.made()], self.ranks)  # told to while meshes were decoded
-            batches = self._batches()
-            while self.done < self.last_step and not (self.finished or self.stopping or self.out_of_time):
-                self._step(batches)
-        if self.done < self.last_step and not self.finished:
-            self._stopped_early()
-        return self.done
 
-    def _watch(self, around: contextlib.ExitStack) -> None:
-        """Open what rank 0 alone writes to and measures with."""
-        self.probe, self.journal = None, None
-        if self.is_writer:
-            log.info("training meshes are kept in %s", self.bank.where)
-            write_atomically(self.folder / "input.json", json.dumps({"where": self.bank.where}).encode())
-            self.probe = Probe(self.dataset, self.recipe, self.device, self.learner.dtype)
-            self.journal = Journal(self.folder / "metrics.jsonl")
-            around.callback(self.journal.close)
-            around.enter_context(sampling(self.folder / "system.jsonl"))
+def _opened_bank(job: Job, device: torch.device) -> VertexBank:
+    recipe, identities = job.recipe, job.dataset.identities("training")
+    placed: dict[str, Any] = {"device": device, "cache": recipe.cache, "sharers": job.ranks.here}
+    return open_bank(job.dataset, identities, edge_sum=recipe.edge_sum, **placed)
 
-    def _step(self, batches: Iterator[tuple[Any, list[Batch]]]) -> None:
-        """One step, and what is due after it."""
-        with self.meter.waiting():
-            triples, parts = next(batches)
-        values = self.learner.step(parts, share=self.order.share(rank=self.ranks.rank, ranks=self.ranks.count))
-        self.done += 1
-        self._recent.append((self.done, triples, values["loss/total"]))
-        last = self.done == self.last_step
-        probing = last or self._due(self.recipe.evaluate_every)
-        logging_now = probing or self._due(self.recipe.log_every)
-        saving = last or self._due(self.recipe.checkpoint_every)
-        if logging_now or saving or self._due(_CHECK_EVERY[self.device.type]):
-            self._agree_to_go_on()
-        if logging_now:
-            self._log(values, probing)
-        if self.probe and self._due(self.recipe.picture_every):
-            self._draw(self.probe)
-        if saving or self.stopping or self.out_of_time or self.finished or (probing and self.verdict.improved):
-            self._save(best=probing and self.verdict.improved)
 
-    def _due(self, every: int | None) -> bool:
-        return every is not None and self.done % every == 0
+def _batches(job: Job, bank: VertexBank, first_step: int) -> Iterator[tuple[list[Triples], list[Batch]]]:
+    """This rank's share of every step's triples, in parts, and their meshes on the device."""
+    mine = {"rank": job.ranks.rank, "ranks": job.ranks.count, "parts": job.recipe.accumulate}
+    places, augment = job.order.places(**mine), Augmentation(job.recipe)
+    for step, share in enumerate(bank.prefetch(job.order.batches(first_step=first_step, **mine)), first_step):
+        parts = zip(share, places, strict=True)
+        yield share, [augment(bank.batch(triples), step=step, first=first) for triples, first in parts]
 
-    def _batches(self) -> Iterator[tuple[Any, list[Batch]]]:
-        """This rank's share of every step's triples, in parts, and their meshes on the device."""
-        mine = {"rank": self.ranks.rank, "ranks": self.ranks.count, "parts": self.recipe.accumulate}
-        places, augment = self.order.places(**mine), Augmentation(self.recipe)
-        shares = self.bank.prefetch(self.order.batches(first_step=self.done, **mine))
-        for step, share in enumerate(shares, self.done):
-            yield (
-                share,
-                [
-                    augment(self.bank.batch(triples), step=step, first=first)
-                    for triples, first in zip(share, places, strict=True)
-                ],
+
+def _save(job: Job, state: State, observer: Observer | None, *, finished: bool, best: bool) -> None:
+    """Rank 0 writes a checkpoint, all wait, and a failure to write stops every rank."""
+    random, learner = gathered(random_state(), job.ranks), state.learner
+    about = {
+        "step": state.step,
+        "last_step": job.last_step,
+        "finished": finished,
+        "recipe": job.recipe.model_dump(mode="json"),
+        "dataset": job.dataset.uuid,
+        "dataset_sha256": job.dataset.attributes["manifest_sha256"],
+    }
+
+    def write() -> None:
+        if observer:
+            observer.journal.sync()
+            save_checkpoint(
+                job.run,
+                about=about,
+                weights=learner.network.state_dict(),
+                average=learner.average.weights if learner.average else None,
+                state=learner.state() | {"verdict": state.verdict.state(), "random": random},
+                keep=job.recipe.keep_checkpoints,
+                best=best,
             )
 
-    def _agree_to_go_on(self) -> None:
-        """One exchange between the ranks: whether any gradient was not finite, and whether any was told to stop."""
-        bad_step = self.learner.bad_step
-        recent, self._recent = self._recent, []
-        flags = [bad_step > 0, self._stop.made(), self._spent()]
-        any_bad, self.stopping, self.out_of_time = any_rank(flags, self.ranks)
-        if any_bad:
-            stop_for(broken_step(bad_step, recent, self.ranks.rank), self.folder, self.ranks)
+    agreed(job.ranks, write, what="write a checkpoint")
 
-    def _spent(self) -> bool:
-        budget = self.recipe.budget
-        return budget is not None and time.monotonic() - self._began > budget_seconds(budget)
 
-    def _log(self, values: dict[str, Any], probing: bool) -> None:
-        shared = mean_over_ranks(values, self.ranks)
-        decided = decided_by_first(self.ranks, lambda: self._measure_and_write(shared, probing))
-        if decided is not None:
-            self.verdict, self.finished = decided
-
-    def _measure_and_write(self, shared: dict[str, float], probing: bool) -> tuple[Verdict, bool] | None:
-        """Rank 0's part; the verdict if it was time for one."""
-        assert self.probe is not None and self.journal is not None
-        measured: dict[str, float] = {}
-        if probing:
-            with self.learner.evaluated():
-                measured = self.probe.measure(self.learner.network)
-        self.journal.write(self.done, shared | measured | self.meter.read())
-        self._say(shared | measured)
-        return self._judge(self.probe, measured) if probing else None
-
-    def _say(self, row: dict[str, float]) -> None:
-        """For launchers that show nothing themselves; at intervals."""
-        self.progress.add({"step": self.done, "time": time.time(), **row})
-        if time.monotonic() - self._said > _SAY_EVERY or self.done == self.last_step:
-            log.info("%s", self.progress.line())
-            self._said = time.monotonic()
-
-    def _judge(self, probe: Probe, measured: dict[str, float]) -> tuple[Verdict, bool]:
-        verdict = self.verdict.after(probe.decisive(measured))
-        return verdict, verdict.gives_up(self.recipe.early_stopping)
-
-    def _draw(self, probe: Probe) -> None:
-        """A picture that cannot be drawn or written ends no training."""
-        try:
-            with self.learner.evaluated():
-                probe.draw(self.learner.network, snapshot_path(self.folder, self.done), title=f"step {self.done:,}")
-        except Exception as error:
-            log.warning("no picture of step %s: %s: %s", self.done, type(error).__name__, error)
-
-    def _save(self, *, best: bool) -> None:
-        """Rank 0 writes, all wait, and a failure to write stops every rank."""
-        random = random_states(self.ranks.count)
-
-        def write() -> None:
-            if self.journal:
-                self.journal.sync()
-                self._write(random, best=best)
-
-        agreed(self.ranks, write, what="write a checkpoint")
-
-    def _write(self, random: list[dict[str, torch.Tensor]], *, best: bool) -> None:
-        save_checkpoint(
-            self.folder,
-            about={
-                "step": self.done,
-                "last_step": self.last_step,
-                "finished": self.finished or self.done == self.last_step,
-                "recipe": self.recipe.model_dump(mode="json"),
-                "dataset": self.dataset.uuid,
-                "dataset_sha256": self.dataset.attributes["manifest_sha256"],
-            },
-            weights=self.learner.network.state_dict(),
-            average=self.learner.average.weights if self.learner.average else None,
-            state=self.learner.state() | {"verdict": self.verdict.state(), "random": random},
-            keep=self.recipe.keep_checkpoints,
-            best=best,
+def _stopped(job: Job, step: int, reason: StopReason | None) -> TrainingStopped:
+    where = f"at step {step} of {job.last_step}"
+    kept = "a checkpoint was written" if step else "before anything was learned"
+    if reason is StopReason.BUDGET:
+        return BudgetSpent(
+            f"the time budget of {job.recipe.budget} is spent {where}; {kept}. Run the same command again to resume"
         )
-
-    def _go_on_from(self, found: Checkpoint) -> None:
-        state = state_of(found, averaged=self.recipe.average is not None)
-        try:
-            self.learner.load(found, state)
-            restore_random_state(state["random"], self.ranks.rank)
-            self.verdict = Verdict.resumed(state["verdict"], triples=self.recipe.evaluate_triples)
-        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            raise unusable_state(found.path, f"{type(error).__name__}: {reason_of(error)}") from error
-        self.done, self.finished = found.step, found.finished
-
-    def _stopped_early(self) -> None:
-        where = f"at step {self.done} of {self.last_step}"
-        kept = "a checkpoint was written" if self.done else "before anything was learned"
-        if self.out_of_time and not self.stopping:
-            raise BudgetSpent(
-                f"the time budget of {self.recipe.budget} is spent {where}; {kept}. "
-                "Run the same command again to go on from here"
-            )
-        raise TrainingStopped(f"stopped {where} as told; {kept}. Run the same command again to go on from here")
+    return TrainingStopped(f"stopped {where} as told; {kept}. Run the same command again to resume")

@@ -10,17 +10,12 @@ from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoin
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.weights import fill_network
 from training.data.batch import Batch
-from training.networks import build_network
+from training.networks import network_from
 from training.networks.execution import GraphedTransfer
 from training.networks.padded_batches import MixedCounts
-from training.recipes.training import NetworkRecipe, TrainingRecipe
+from training.recipes.training import TrainingRecipe
 
 _MESHES_AT_ONCE = 8
-
-
-def network_from(recipe: NetworkRecipe) -> nn.Module:
-    """The network that a recipe describes, freshly initialised."""
-    return build_network(recipe.name, **recipe.model_dump(exclude={"name"}))
 
 
 def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, TrainingRecipe, int]:

@@ -11,13 +11,18 @@ from torch import nn
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
+from training.recipes.training import NetworkRecipe
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
     "corenet3d": CoreNet3D,
     "dsffnet": DSFFNet,
     "npt": NPT,
 }
-"""Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both."""
+"""Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both.
+
+A network may have ``accumulation()``: a context around the parts of a training step, for what must not change between
+them.
+"""
 
 
 def build_network(name: str, **options: Any) -> nn.Module:
@@ -44,3 +49,8 @@ def build_network(name: str, **options: Any) -> nn.Module:
         nearest = difflib.get_close_matches(name, NETWORKS, n=1, cutoff=0.0)[0]
         raise ValueError(f"unknown network {name!r}; did you mean {nearest!r}? Known: {', '.join(sorted(NETWORKS))}")
     return NETWORKS[name](**options)
+
+
+def network_from(recipe: NetworkRecipe) -> nn.Module:
+    """Return the network that a recipe describes, freshly initialised."""
+    return build_network(recipe.name, **recipe.model_dump(exclude={"name"}))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
-from training.networks.layers.elain import SLOPE, Generator
+from training.networks.layers.elain import SLOPE, Generator, iterated_once
 from training.networks.layers.input_checks import check_pair
 from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
 from training.networks.layers.optimal_transport import transport_matrix, warp
@@ -121,6 +122,10 @@ class CoreNet3D(nn.Module):
         with full_precision(source):
             warped = warp(theta, phi, source)
         return self._refined(warped, identity)
+
+    def accumulation(self) -> AbstractContextManager[None]:
+        """Iterate the spectral norms once, then never while the block runs: for the parts of one training step."""
+        return iterated_once(self)
 
     def forward_with_correspondence(self, *, source: Tensor, target: Tensor) -> Transfer:
         """Return the same with the warped points and the transport matrix, which is held (twice) in memory.

@@ -15,7 +15,7 @@ from training.checkpoints.compat import recipe_of
 from training.checkpoints.folder import AVERAGE, WEIGHTS, sha256_of
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
-from training.inference.predict import network_from
+from training.networks import network_from
 from training.recipes.training import NptRecipe, TrainingRecipe
 from training.reports.blocks import Block, Code, Facts, Picture, Section, Table, Text, shown
 from training.reports.card_texts import (

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import TypeAdapter
 
-from datagen.common.errors import CheckpointError, DsffnetError, TrainingError, TrainingStopped
+from datagen.common.errors import DsffnetError, TrainingError, TrainingStopped
 from datagen.common.files import read_text_within, refuse_links_out, write_atomically
 from datagen.common.json_files import read_json_if_whole
 from datagen.generate import generate
@@ -20,9 +20,9 @@ from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, ManifestRow, open_dataset
 from datagen.store.verify import describe
 from training.checkpoints.checkpoint import Which, is_finished, load_checkpoint, require_checkpoint
-from training.checkpoints.compat import recipe_of
 from training.data.triples import last_step_of, order_of
 from training.engine.launch import launch
+from training.engine.resume import require_same_training
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_rows, triples_in, write_rows
 from training.evaluation.method_names import method_name
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, report
@@ -188,22 +188,15 @@ def _no_ops(rows: list[Row]) -> dict[str, float]:
 
 
 def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
-    """Refuse a run that learned by another recipe or on other data, before anything in it is touched.
+    """Refuse a run that was trained by another recipe or on other data, before anything in it is touched.
 
     Raises
     ------
     CheckpointError, RecipeError
         It did; the message says what differs.
     """
-    found = load_checkpoint(run)
-    if found is None:
-        return
-    if found.dataset != dataset.uuid:
-        raise CheckpointError(
-            f"{run} was trained on dataset {found.dataset}, not on {dataset.url} ({dataset.uuid}). "
-            "Choose another --out, or add --fresh to start over"
-        )
-    recipe.require_same_learning(recipe_of(found), where=str(run))
+    if found := load_checkpoint(run):
+        require_same_training(recipe, dataset, run, found)
 
 
 def is_complete(data: str) -> bool:
@@ -219,8 +212,10 @@ def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:
     """Whether a run holds a sound checkpoint of the end of this recipe's training on this dataset."""
     try:
         dataset, found = open_dataset(data), load_checkpoint(run)
-        check_run_accepts(recipe, dataset, run)
-        return found is not None and is_finished(found, last_step_of(recipe, dataset))
+        if found is None:
+            return False
+        require_same_training(recipe, dataset, run, found)
+        return is_finished(found, last_step_of(recipe, dataset))
     except DsffnetError:
         return False
 

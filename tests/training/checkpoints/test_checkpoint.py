@@ -15,7 +15,7 @@ from tests.support.files import flip_bit, truncate
 from training.checkpoints import weights
 from training.checkpoints.checkpoint import export_weights, load_checkpoint, require_checkpoint, save_checkpoint
 from training.checkpoints.weights import fill_network
-from training.engine.distributed import random_states, restore_random_state
+from training.engine.distributed import random_state, restore_random_state
 
 
 def save(run: Path, step: int, keep: int = 3, **more: Any) -> Path:
@@ -252,7 +252,7 @@ def test_random_states_survive_a_checkpoint(tmp_path: Path) -> None:
     torch.manual_seed(5)
     about = {"step": 1, "recipe": {}, "dataset": "uuid"}
     values = {"w": torch.zeros(1)}
-    save_checkpoint(tmp_path, about=about, weights=values, state={"random": random_states()}, keep=1)
+    save_checkpoint(tmp_path, about=about, weights=values, state={"random": [random_state()]}, keep=1)
     expected = torch.rand(4)
     torch.manual_seed(6)
     states = require_checkpoint(tmp_path).state()["random"]

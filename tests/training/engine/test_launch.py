@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from datagen.common.errors import RecipeError, TrainingError
+from datagen.common.errors import BudgetSpent, RecipeError, TrainingError
 from tests.support.ranks import ROOT
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.engine import launch
-from training.engine.distributed import STOP_FILE, BudgetSpent
+from training.engine.distributed import STOP_FILE
 from training.recipes.files import recipe_in
 
 
@@ -37,7 +37,7 @@ class Dying:
 
 def test_ranks_that_die_with_progress_are_started_again_and_again(tmp_path: Path) -> None:
     fit = Dying(tmp_path, [10, 20, 30, 40, 50, 60, 70])
-    launch._fit(fit, tmp_path)
+    launch.fit_while_progressing(fit, tmp_path)
     assert fit.calls == 7
 
 
@@ -49,7 +49,7 @@ def test_without_progress_or_told_to_stop_or_with_something_to_mend_it_ends(
     if left_over:
         (tmp_path / left_over).touch()
     with pytest.raises(RuntimeError, match="a node was lost"):
-        launch._fit(fit, tmp_path)
+        launch.fit_while_progressing(fit, tmp_path)
     assert fit.calls == (2 if left_over is None else 1)
 
 
@@ -64,7 +64,7 @@ def test_the_budget_counts_from_the_drivers_start(dataset: str, tmp_path: Path, 
     (run / ".launch").write_text("its")
     late = pytest.raises(BudgetSpent, match="budget of 10min is spent at step 1 of 8") if steps == 1 else nullcontext()
     with late:
-        launch._rank(config | {"began": time.time() - ago})
+        launch.train_rank(config | {"began": time.time() - ago})
     assert require_checkpoint(run).step == steps
 
 
@@ -79,23 +79,16 @@ def test_the_budget_counts_from_the_drivers_start(dataset: str, tmp_path: Path, 
         ({"ranks": 1, "device": "cpu"}, 4, True, False),
     ],
 )
-def test_gpus_are_the_clusters(
-    changes: dict[str, int], gpus: int, torch_sees_them: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launch, "_cluster", {"GPU": gpus, "CPU": 1}.get)
-    monkeypatch.setattr(launch, "_torch_there_uses_gpus", lambda: torch_sees_them)
+def test_gpus_are_the_clusters(changes: dict[str, int], gpus: int, torch_sees_them: bool, expected: bool) -> None:
     recipe = tiny_training(**{"launcher": "ray", "device": "auto"} | changes)
-    assert launch._on_gpus(recipe) == expected
+    assert launch.on_gpus(recipe, lambda: gpus, lambda: torch_sees_them) == expected
 
 
 @pytest.mark.parametrize(("changes", "key"), [({}, "ranks is 4"), ({"fewest_ranks": 3}, "fewest_ranks is 3")])
-def test_too_few_machines_are_said_by_the_key_that_asks(
-    changes: dict[str, int], key: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(launch, "_cluster", lambda _: 2)
+def test_too_few_machines_are_said_by_the_key_that_asks(changes: dict[str, int], key: str) -> None:
     recipe = tiny_training(launcher="ray", ranks=4, **changes)
     with pytest.raises(TrainingError, match=rf"training\.{key}, but the cluster has 2 CPUs"):
-        launch._require(recipe, "CPU")
+        launch.require_enough(recipe, 2, "CPU")
 
 
 @pytest.mark.parametrize("whole", [True, False])

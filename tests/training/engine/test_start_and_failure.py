@@ -11,11 +11,10 @@ import pytest
 from datagen.common.errors import DatasetError, StorageError, TrainingError, TrainingStopped
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset, tiny_training
-from training.engine import trainer
-from training.engine import validation as probe
+from training.engine import trainer, validation
 from training.engine.distributed import STOP_FILE, Ranks, agreed, decided_by_first
+from training.engine.state import Verdict
 from training.engine.trainer import train
-from training.engine.validation import Verdict
 
 ALONE = Ranks(0, 1, 0)
 
@@ -24,10 +23,10 @@ def must_not_be_called(*_: object, **__: object) -> Any:
     raise AssertionError("opened although there is nothing to do with it")
 
 
-def test_a_finished_run_opens_neither_bank_nor_probe(dataset: str, tmp_path: Path, monkeypatch) -> None:
+def test_a_finished_run_opens_neither_meshes_nor_journal(dataset: str, tmp_path: Path, monkeypatch) -> None:
     train(tiny_training(), data=dataset, run=tmp_path)
     monkeypatch.setattr(trainer, "open_bank", must_not_be_called)
-    monkeypatch.setattr(trainer, "Probe", must_not_be_called)
+    monkeypatch.setattr(trainer, "observing", must_not_be_called)
     assert train(tiny_training(), data=dataset, run=tmp_path) == 8
 
 
@@ -88,7 +87,7 @@ def test_a_picture_that_cannot_be_written_is_a_warning(dataset: str, tmp_path: P
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(probe, "draw_snapshot", full)
+    monkeypatch.setattr(validation, "draw_snapshot", full)
     assert train(tiny_training(picture_every=4), data=dataset, run=tmp_path) == 8
     assert "no picture of step 4" in caplog.text and "No space left" in caplog.text
 

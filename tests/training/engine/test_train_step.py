@@ -1,6 +1,5 @@
 """One step means the same however it is cut: over ranks, over parts, over interruptions, over vertex counts."""
 
-import contextlib
 import json
 import shutil
 import time
@@ -10,18 +9,19 @@ from typing import Any
 import pytest
 import torch
 
-from datagen.common.errors import CheckpointError, TrainingError
+from datagen.common.errors import BudgetSpent, CheckpointError, TrainingError
 from datagen.generate import generate
-from tests.support.ranks import finish, start_ranks
+from tests.support.ranks import finish, start_ranks, train_in_turn
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
-from training.engine import train_step as learner
 from training.engine import trainer
-from training.engine.distributed import BudgetSpent
+from training.engine.train_step import Learner
 from training.engine.trainer import train
+from training.networks.corenet3d import CoreNet3D
+from training.recipes.training import TrainingRecipe
 from training.tracking.journal import read_journal
 
-TWENTY = {"steps": 20, "checkpoint_every": 20, "evaluate_every": 20}
+TEN = {"steps": 10, "checkpoint_every": 5, "evaluate_every": 10}
 
 
 def losses(run: Path) -> torch.Tensor:
@@ -40,31 +40,52 @@ NETWORKS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("network", "precision", "tolerance"),
-    [
-        ("dsffnet", "float64", 1e-6),
-        ("dsffnet", "float32", 1e-4),
-        ("npt", "float64", 1e-6),
-        ("corenet3d", "float64", 1e-6),
-    ],
-)
-def test_one_rank_equals_two_ranks_equals_parts(
-    dataset: str, tmp_path: Path, network: str, precision: str, tolerance: float
-) -> None:
-    given = {**TWENTY, "precision": precision, "average": 0.9, "network": NETWORKS[network]}
-    train(tiny_training(**given), data=dataset, run=tmp_path / "one")
-    train(tiny_training(**given, accumulate=2), data=dataset, run=tmp_path / "parts")
-    two = tiny_training(**given, launcher="ray", ranks=2, accumulate=2)
-    results = finish(start_ranks(two, data=dataset, run=tmp_path / "two", count=2))
-    assert [status for status, _ in results] == [0, 0], results
-    for run in ("parts", "two"):
-        assert torch.allclose(losses(tmp_path / run), losses(tmp_path / "one"), rtol=tolerance, atol=0), run
+CUTS = {
+    "dsffnet": ("float64", 1e-6),
+    "dsffnet in float32": ("float32", 1e-4),
+    "npt": ("float64", 1e-6),
+    "corenet3d": ("float64", 1e-6),
+}
+"""Networks trained by one rank, by one in parts and by two; the tolerance of their losses."""
+
+
+def cut(name: str, **changes: Any) -> TrainingRecipe:
+    given = {**TEN, "precision": CUTS[name][0], "average": 0.9, "network": NETWORKS[name.split(maxsplit=1)[0]]}
+    return tiny_training(**given | changes)
+
+
+@pytest.fixture(scope="module")
+def by_two(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs by two ranks in two parts each; ``dsffnet resumed`` was begun by one rank, which did half of it."""
+    place = tmp_path_factory.mktemp("two")
+    resumed = place / "dsffnet resumed"
+    train(cut("dsffnet"), data=str(_pristine), run=resumed)
+    shutil.rmtree(resumed / "checkpoints" / "step-00000010")
+    lines = (resumed / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (resumed / "metrics.jsonl").write_text("".join(lines[:5]))
+    jobs = [(cut(name, launcher="ray", ranks=2, accumulate=2), place / name) for name in CUTS]
+    jobs.append((cut("dsffnet", launcher="ray", ranks=2), resumed))
+    train_in_turn(jobs, data=str(_pristine), place=place)
+    return place
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_one_rank_equals_two_ranks_equals_parts(dataset: str, tmp_path: Path, by_two: Path, name: str) -> None:
+    train(cut(name), data=dataset, run=tmp_path / "one")
+    train(cut(name, accumulate=2), data=dataset, run=tmp_path / "parts")
+    for run in (tmp_path / "parts", by_two / name):
+        assert torch.allclose(losses(run), losses(tmp_path / "one"), rtol=CUTS[name][1], atol=0), run
+
+
+def test_a_run_of_one_rank_is_resumed_by_two(dataset: str, tmp_path: Path, by_two: Path) -> None:
+    train(cut("dsffnet"), data=dataset, run=tmp_path / "whole")
+    assert len(losses(by_two / "dsffnet resumed")) == 10
+    assert torch.allclose(losses(by_two / "dsffnet resumed"), losses(tmp_path / "whole"), rtol=1e-6, atol=0)
 
 
 def test_three_ranks_share_a_batch_of_four_unequally(dataset: str, tmp_path: Path) -> None:
     """As when an elastic group has lost a node."""
-    given = {**TWENTY, "precision": "float64"}
+    given = {**TEN, "precision": "float64"}
     train(tiny_training(**given), data=dataset, run=tmp_path / "one")
     three = tiny_training(**given, launcher="ray", ranks=4, fewest_ranks=1)
     results = finish(start_ranks(three, data=dataset, run=tmp_path / "three", count=3))
@@ -77,23 +98,9 @@ def test_a_spectral_norm_iterates_once_a_step_and_a_single_part_is_as_without(
 ) -> None:
     given = {"network": NETWORKS["corenet3d"]}
     train(tiny_training(**given), data=dataset, run=tmp_path / "once")
-    monkeypatch.setattr(learner, "iterated_once", lambda network: contextlib.nullcontext())
+    monkeypatch.delattr(CoreNet3D, "accumulation")
     train(tiny_training(**given), data=dataset, run=tmp_path / "by itself")
     assert same_bits(tmp_path / "once", tmp_path / "by itself")
-
-
-def test_a_run_of_one_rank_goes_on_with_two(dataset: str, tmp_path: Path) -> None:
-    given = {**TWENTY, "checkpoint_every": 10, "precision": "float64", "average": 0.9}
-    train(tiny_training(**given), data=dataset, run=tmp_path / "whole")
-    shutil.copytree(tmp_path / "whole", tmp_path / "moved")
-    shutil.rmtree(tmp_path / "moved" / "checkpoints" / "step-00000020")
-    lines = (tmp_path / "moved" / "metrics.jsonl").read_text().splitlines(keepends=True)
-    (tmp_path / "moved" / "metrics.jsonl").write_text("".join(lines[:10]))
-    two = tiny_training(**given, launcher="ray", ranks=2)
-    results = finish(start_ranks(two, data=dataset, run=tmp_path / "moved", count=2))
-    assert [status for status, _ in results] == [0, 0], results
-    assert len(losses(tmp_path / "moved")) == 20
-    assert torch.allclose(losses(tmp_path / "moved"), losses(tmp_path / "whole"), rtol=1e-6, atol=0)
 
 
 def test_augmented_training_resumes_to_the_bit(dataset: str, tmp_path: Path) -> None:
@@ -141,7 +148,7 @@ def test_early_stopping_ends_the_run_for_good(dataset: str, tmp_path: Path) -> N
 
 
 def test_the_best_checkpoint_is_that_of_the_lowest_unseen_pmd(dataset: str, tmp_path: Path) -> None:
-    recipe = tiny_training(steps=60, learning_rate=0.05, evaluate_every=5, checkpoint_every=20, keep_checkpoints=1)
+    recipe = tiny_training(steps=24, learning_rate=0.05, evaluate_every=2, checkpoint_every=8, keep_checkpoints=1)
     train(recipe, data=dataset, run=tmp_path / "run")
     rows = [row for row in read_journal(tmp_path / "run" / "metrics.jsonl") if "evaluation/pmd_unseen" in row]
     best = min(rows, key=lambda row: row["evaluation/pmd_unseen"])
@@ -172,11 +179,11 @@ def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
     dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
 ) -> None:
     """As on a GPU, where nobody waits to see: the weights are those before the step all the same."""
-    monkeypatch.setitem(trainer._CHECK_EVERY, "cpu", every)
+    monkeypatch.setitem(trainer.CHECK_EVERY, "cpu", every)
     saved: dict[int, dict[str, torch.Tensor]] = {}
-    real = trainer.Learner.step
+    real = Learner.step
 
-    def spoiled(self: trainer.Learner, parts: list, **keywords: float) -> dict:
+    def spoiled(self: Learner, parts: list, **keywords: float) -> dict:
         number = len(saved) + 1
         saved[number] = {name: value.clone() for name, value in self.network.state_dict().items()}
         if number == 6:
@@ -184,8 +191,8 @@ def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
         last.append(self)
         return real(self, parts, **keywords)
 
-    last: list[trainer.Learner] = []
-    monkeypatch.setattr(trainer.Learner, "step", spoiled)
+    last: list[Learner] = []
+    monkeypatch.setattr(Learner, "step", spoiled)
     recipe = tiny_training(steps=40, log_every=40, evaluate_every=40, checkpoint_every=40)
     with pytest.raises(TrainingError, match=r"not finite at step 6 \(this rank's triples were \[\["):
         train(recipe, data=dataset, run=tmp_path / "run")
@@ -199,7 +206,7 @@ def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
 def test_a_gradient_alone_that_is_not_finite_names_its_step(
     dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(trainer._CHECK_EVERY, "cpu", 8)
+    monkeypatch.setitem(trainer.CHECK_EVERY, "cpu", 8)
     real, calls = torch.nn.utils.clip_grad_norm_, []
 
     def spoiled(*arguments: Any) -> torch.Tensor:
@@ -232,7 +239,7 @@ def test_identities_of_different_vertex_counts_train_together(tmp_path: Path) ->
     body = {"family": "mixed", "bodies": [{"family": "leg", "rings": 8, "segments": 4}, {"family": "leg", "rings": 6}]}
     data = str(tmp_path / "mixed.zarr")
     generate(tiny_dataset(body=body, identities={"training": 4, "evaluation": 2}), data)
-    given = {**TWENTY, "steps": 60, "precision": "float64"}
+    given = {**TEN, "steps": 24, "learning_rate": 0.01, "precision": "float64"}
     train(tiny_training(**given), data=data, run=tmp_path / "one")
     train(tiny_training(**given, accumulate=4), data=data, run=tmp_path / "parts")
     assert torch.allclose(losses(tmp_path / "one"), losses(tmp_path / "parts"), rtol=1e-5, atol=0)

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from tests.support.recipes import tiny_dataset, tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.engine import distributed as ranks
 from training.engine.distributed import Ranks, alone_in
-from training.engine.trainer import train
+from training.engine.trainer import Due, train
 from training.tracking.journal import read_journal
 
 
@@ -46,16 +47,17 @@ def same_bits(first: Path, second: Path) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-@pytest.fixture
-def undisturbed(dataset: str, tmp_path: Path) -> Path:
-    run = tmp_path / "undisturbed"
-    assert train(tiny_training(), data=dataset, run=run) == 8
+@pytest.fixture(scope="module")
+def undisturbed(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run; tests that change it copy it."""
+    run = tmp_path_factory.mktemp("undisturbed") / "run"
+    assert train(tiny_training(), data=str(_pristine), run=run) == 8
     return run
 
 
 def test_it_learns(dataset: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    train(tiny_training(steps=150, learning_rate=0.01), data=dataset, run=run)
+    train(tiny_training(steps=60, learning_rate=0.02, evaluate_every=60, checkpoint_every=60), data=dataset, run=run)
     assert losses(run)[-10:].mean() < 0.5 * losses(run)[:5].mean()
 
 
@@ -191,10 +193,38 @@ def test_a_run_that_is_in_use_fails_on_every_rank(
     assert all(status == 1 and "another process is training in" in output for status, output in results), results
 
 
-def test_probes_come_when_they_are_due_whatever_is_logged(dataset: str, tmp_path: Path) -> None:
-    train(tiny_training(steps=24, log_every=3, evaluate_every=4), data=dataset, run=tmp_path / "run")
+@pytest.mark.parametrize(
+    ("step", "owes"),
+    [
+        (1, ""),
+        (3, "check log"),
+        (4, "check log validate"),
+        (5, "picture"),
+        (6, "check log"),
+        (7, "check checkpoint"),
+        (8, "check log validate"),
+        (11, "check log validate checkpoint"),
+        (16, "check log validate"),
+        (32, "check log validate"),
+        (35, "check picture checkpoint"),
+    ],
+)
+def test_what_a_step_owes(step: int, owes: str) -> None:
+    """A validation is logged, whatever else is; the last step, 11 here, owes all but a picture."""
+    recipe = tiny_training(steps=40, log_every=3, evaluate_every=4, picture_every=5, checkpoint_every=7)
+    due = Due.after(step, recipe, last_step=11 if step == 11 else 40, check_every=16)
+    assert " ".join(name for name, is_due in asdict(due).items() if is_due) == owes
+
+
+def test_a_gpu_is_looked_at_now_and_then() -> None:
+    recipe = tiny_training(steps=400, log_every=400, evaluate_every=400, checkpoint_every=400)
+    assert [s for s in range(1, 50) if Due.after(s, recipe, last_step=400, check_every=16).check] == [16, 32, 48]
+
+
+def test_validations_come_when_they_are_due_whatever_is_logged(dataset: str, tmp_path: Path) -> None:
+    train(tiny_training(steps=10, log_every=3, evaluate_every=4), data=dataset, run=tmp_path / "run")
     rows = read_journal(tmp_path / "run" / "metrics.jsonl")
-    assert [row["step"] for row in rows if "evaluation/pmd_seen" in row] == [4, 8, 12, 16, 20, 24]
+    assert [row["step"] for row in rows if "evaluation/pmd_seen" in row] == [4, 8, 10]
 
 
 def test_another_dataset_or_recipe_is_refused(dataset: str, undisturbed: Path, tmp_path: Path) -> None:
