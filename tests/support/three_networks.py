@@ -15,6 +15,7 @@ from tests.literal.npt import LiteralNPT
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
+from training.networks.released_weights import released_names
 
 FORMS: dict[str, Callable[..., nn.Module]] = {
     "dsffnet": DSFFNet,
@@ -28,7 +29,7 @@ LITERAL: dict[str, Callable[[Any], nn.Module]] = {
     "npt origin": LiteralNPT,
     "corenet3d": LiteralCoreNet3D,
 }
-_PAIRING = "npt origin"
+PAIRING = "npt origin"
 """The form whose source and target must have equally many vertices."""
 
 _NARROW: dict[str, dict[str, Any]] = {
@@ -43,15 +44,17 @@ _WIDE: dict[str, dict[str, Any]] = {
 }
 
 
-def initial(form: str, *, wide: bool = False, seed: int = 0) -> nn.Module:
-    """Return the form as it is before training, in float32."""
+def initial(form: str, *, wide: bool = False, seed: int = 0, **options: Any) -> nn.Module:
+    """Return the form as it is before training, in float32; ``options`` of its constructor go before its widths."""
     torch.manual_seed(seed)
-    return FORMS[form](**(_WIDE if wide else _NARROW)[form.split(maxsplit=1)[0]])
+    return FORMS[form](**(_WIDE if wide else _NARROW)[form.split(maxsplit=1)[0]] | options)
 
 
-def lively(form: str, *, wide: bool = False, seed: int = 0) -> nn.Module:
+def lively(
+    form: str, *, wide: bool = False, seed: int = 0, dtype: torch.dtype = torch.float32, **options: Any
+) -> nn.Module:
     """Return the form with weights that keep the size of what they act on, so that every part of it has an effect."""
-    network = initial(form, wide=wide, seed=seed)
+    network = initial(form, wide=wide, seed=seed, **options).to(dtype)
     for name, parameter in network.named_parameters():
         if parameter.ndim == 2:
             nn.init.normal_(parameter, 0, parameter.shape[1] ** -0.5)
@@ -76,7 +79,7 @@ def meshes(vertices: int, *, seed: int, batch: int = 2, dtype: torch.dtype = tor
 
 def pair(form: str, *, source: int = 33, target: int = 27, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     """Return a source and a target, of different numbers of vertices where the form takes them."""
-    source = target if form == _PAIRING else source
+    source = target if form == PAIRING else source
     return {"source": meshes(source, seed=1, dtype=dtype), "target": meshes(target, seed=2, dtype=dtype)}
 
 
@@ -85,6 +88,25 @@ def loss_gradients(network: nn.Module, inputs: dict[str, Tensor]) -> dict[str, T
     network.zero_grad()
     _loss(network, inputs).backward()
     return {name: parameter.grad.clone() for name, parameter in network.named_parameters()}
+
+
+def functional_gradients(network: nn.Module, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the output and all gradients of a random functional of it, parameters by the fast form's names."""
+    network.zero_grad()
+    inputs = {name: mesh.detach().clone().requires_grad_() for name, mesh in inputs.items()}
+    output = network(**inputs)
+    weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(5), dtype=output.dtype)
+    (output * weights.to(output.device)).sum().backward()
+    gradients = {own_name(network, name): parameter.grad.flatten() for name, parameter in network.named_parameters()}
+    return {"output": output.detach()} | {name: mesh.grad for name, mesh in inputs.items()} | gradients
+
+
+def own_name(network: nn.Module, name: str) -> str:
+    """Return the name of a parameter in the fast form; the literal 3D-CoreNet has the released ones."""
+    if not isinstance(network, LiteralCoreNet3D):
+        return name
+    parts = ("correspondence", "generator")
+    return {f"{part}.{given}": own for part in parts for own, given in released_names(part).items()}[name]
 
 
 def fitted(form: str, steps: int = 40) -> nn.Module:

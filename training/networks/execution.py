@@ -157,6 +157,11 @@ class GraphedTransfer:
             graph = self._graph(source, target)
             return graph.replay(source, target) if graph else self._run(source, target)
 
+    @property
+    def recorded(self) -> int:
+        """Graphs of the network that are recorded now."""
+        return sum(graph is not None for graph in _GRAPHS.get(self._network, {}).values())
+
     def _graph(self, source: Tensor, target: Tensor) -> _Graph | None:
         """The graph of these shapes; None at their first call, which may be the only one."""
         graphs = _GRAPHS.setdefault(self._network, {})

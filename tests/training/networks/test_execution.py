@@ -3,10 +3,8 @@
 On a machine with torch and pytest alone: ``pytest --noconftest -m gpu tests/training/networks/test_execution.py``.
 """
 
-import contextlib
 import gc
-import threading
-import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -15,8 +13,7 @@ from torch import Tensor, nn
 
 from datagen.common.errors import CompilerError
 from tests.support.one_rank import two_backward_passes
-from training.networks import build_network
-from training.networks import execution as acceleration
+from training.networks import build_network, execution
 from training.networks.execution import GraphedTransfer, compiled, precision
 
 SMALL: dict[str, dict[str, object]] = {
@@ -134,14 +131,6 @@ def test_features_far_from_zero_keep_their_differences_under_autocast() -> None:
     assert torch.equal(features.grad, torch.arange(5.0).expand(2, 64, 5))
 
 
-@torch.no_grad()
-def test_a_broken_coordinate_shows_in_its_own_mesh_only(network: nn.Module) -> None:
-    broken = pair()
-    broken["target"][1, 3, 0] = torch.nan
-    output = network(**broken)
-    assert torch.isfinite(output[0]).all() and torch.isnan(output[1]).all()
-
-
 @pytest.mark.gpu
 @torch.no_grad()
 def test_tf32_stays_close(network: nn.Module) -> None:
@@ -152,128 +141,10 @@ def test_tf32_stays_close(network: nn.Module) -> None:
         assert (network(**meshes) - exact).square().mean() < 1e-6
 
 
-class Recorded:
-    """Stands in for a CUDA graph: that it was recorded, and how often it was replayed."""
-
-    made: list["Recorded"]
-
-    def __init__(self, run: object, source: Tensor, target: Tensor) -> None:
-        self.replays = 0
-        self.made.append(self)
-
-    def replay(self, source: Tensor, target: Tensor) -> str:
-        self.replays += 1
-        return "replayed"
-
-
-class OnGpu:
-    """A mesh that says it is on a GPU."""
-
-    dtype, device = torch.float32, torch.device("cuda", 0)
-
-    def __init__(self, *shape: int) -> None:
-        self.shape = torch.Size(shape)
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-
-class Counted(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight, self.calls = nn.Parameter(torch.zeros(3)), 0
-
-    def forward(self, *, source: Tensor, target: Tensor) -> str:
-        self.calls += 1
-        return f"{tuple(source.shape)} {tuple(target.shape)}"
-
-
-@pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Recorded]:
-    """Bookkeeping of graphs without a GPU."""
-    Recorded.made = []
-    monkeypatch.setattr(acceleration, "_Graph", Recorded)
-    monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
-    return Recorded.made
-
-
-def test_a_pair_is_called_first_then_recorded_then_replayed(recorded: list[Recorded]) -> None:
-    network = Counted().eval()
-    call = GraphedTransfer(network)
-    assert call(source=OnGpu(1, 5, 3), target=OnGpu(1, 4, 3)) == "(1, 5, 3) (1, 4, 3)" and not recorded
-    for _ in range(3):
-        GraphedTransfer(network)(source=OnGpu(1, 5, 3), target=OnGpu(1, 4, 3))
-    assert [graph.replays for graph in recorded] == [3]
-    assert len(recorded) == 1
-    assert GraphedTransfer(network, precision="tf32")(source=OnGpu(1, 5, 3), target=OnGpu(1, 4, 3)) != "replayed"
-
-
-def test_batches_and_networks_in_training_are_never_recorded(recorded: list[Recorded]) -> None:
-    network = Counted()
-    call = GraphedTransfer(network)
-    for _ in range(3):
-        call(source=OnGpu(1, 5, 3), target=OnGpu(1, 4, 3))
-        network.eval()(source=OnGpu(1, 5, 3), target=OnGpu(1, 4, 3))
-        call(source=OnGpu(2, 5, 3), target=OnGpu(2, 4, 3))
-        network.train()
-    assert not recorded and network.calls == 9
-
-
-def test_the_latest_shapes_are_kept(recorded: list[Recorded]) -> None:
-    call = GraphedTransfer(Counted().eval(), kept=2)
-
-    def twice(vertices: int) -> None:
-        for _ in range(2):
-            call(source=OnGpu(1, 5, 3), target=OnGpu(1, vertices, 3))
-
-    for vertices in (4, 6, 4, 8, 4, 6):
-        twice(vertices)
-    assert [graph.replays for graph in recorded] == [5, 1, 1, 1], "4 stays, being used; 6 made room for 8"
-
-
-def test_replaced_weights_are_not_replayed_and_graphs_go_with_their_network(recorded: list[Recorded]) -> None:
-    before, network = len(acceleration._GRAPHS), Counted().eval()
-    inputs = {"source": OnGpu(1, 5, 3), "target": OnGpu(1, 4, 3)}
-    for _ in range(2):
-        GraphedTransfer(network)(**inputs)
-    with torch.no_grad():
-        network.weight.add_(1)
-    GraphedTransfer(network)(**inputs)
-    assert [graph.replays for graph in recorded] == [2]
-    network.weight = nn.Parameter(torch.ones(3))
-    GraphedTransfer(network)(**inputs)
-    assert [graph.replays for graph in recorded] == [2]
-    del network
-    gc.collect()
-    assert len(acceleration._GRAPHS) == before
-
-
-def test_threads_wait_for_each_other(recorded: list[Recorded], monkeypatch: pytest.MonkeyPatch) -> None:
-    network, inside, most = Counted().eval(), [0], [0]
-
-    def replay(self: Recorded, source: Tensor, target: Tensor) -> str:
-        inside[0] += 1
-        most[0] = max(most[0], inside[0])
-        time.sleep(0.01)
-        inside[0] -= 1
-        return "replayed"
-
-    monkeypatch.setattr(Recorded, "replay", replay)
-    call = GraphedTransfer(network)
-    threads = [
-        threading.Thread(target=call, kwargs={"source": OnGpu(1, 5, 3), "target": OnGpu(1, 4, 3)}) for _ in range(6)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most[0] == 1 and len(recorded) == 1
-
-
 def test_a_pair_on_two_devices_is_refused() -> None:
     source, target = (SimpleNamespace(device=torch.device(name)) for name in ("cuda:0", "cpu"))
     with pytest.raises(ValueError, match="source is on cuda:0, target on cpu"):
-        GraphedTransfer(Counted())(source=source, target=target)
+        GraphedTransfer(nn.Identity())(source=source, target=target)
 
 
 @pytest.mark.parametrize(
@@ -284,14 +155,14 @@ def test_a_pair_on_two_devices_is_refused() -> None:
     ],
 )
 def test_a_missing_compiler_is_said(device: str, variable: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceleration.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(execution.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setenv(variable, "no-such-compiler --flag")
     with pytest.raises(CompilerError, match=message):
         compiled(nn.Linear(3, 3), torch.device(device))
 
 
 def test_a_missing_triton_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceleration.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(execution.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(CompilerError, match="pip install triton"):
         compiled(nn.Linear(3, 3), torch.device("cuda"))
 
@@ -343,8 +214,51 @@ def on_gpu(seed: int, target: int = 70) -> dict[str, Tensor]:
     return {"source": torch.rand(1, 90, 3).cuda() * 2 - 1, "target": torch.rand(1, target, 3).cuda() * 2 - 1}
 
 
-def is_replayed(network: nn.Module) -> bool:
-    return any(graph is not None for graph in acceleration._GRAPHS[network].values())
+def in_precision(network: nn.Module, name: execution.Precision, seed: int) -> Tensor:
+    with precision(name, torch.device("cuda")):
+        return network(**on_gpu(seed))
+
+
+@pytest.mark.gpu
+def test_single_pairs_are_called_first_then_recorded_and_batches_and_training_never(network: nn.Module) -> None:
+    network, recorded = network.cuda(), []
+    graphed = GraphedTransfer(network)
+    for seed in range(3):
+        graphed(**{name: mesh.expand(2, -1, -1) for name, mesh in on_gpu(seed).items()})
+        network.train()
+        graphed(**on_gpu(seed))
+        network.eval()
+        recorded.append(graphed.recorded)
+        graphed(**on_gpu(seed))
+    assert recorded == [0, 0, 1] and GraphedTransfer(network, precision="tf32").recorded == 1, "of the network"
+    GraphedTransfer(network, precision="tf32")(**on_gpu(0))
+    assert graphed.recorded == 1, "a precision has graphs of its own"
+
+
+@pytest.mark.gpu
+def test_the_latest_shapes_are_kept_and_graphs_go_with_their_network() -> None:
+    before = torch.cuda.memory_allocated()
+    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    graphed = GraphedTransfer(network, kept=2)
+    for vertices in (40, 60, 40, 80, 40, 60):
+        for seed in range(2):
+            graphed(**on_gpu(seed, vertices))
+        assert graphed.recorded <= 2
+    del network, graphed
+    gc.collect()
+    assert torch.cuda.memory_allocated() - before < 2**20
+
+
+@pytest.mark.gpu
+@torch.no_grad()
+def test_threads_wait_for_each_other() -> None:
+    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    graphed, inputs = GraphedTransfer(network), [on_gpu(seed) for seed in range(12)]
+    expected = [network(**meshes) for meshes in inputs]
+    with ThreadPoolExecutor(6) as pool:
+        found = list(pool.map(lambda meshes: graphed(**meshes), inputs))
+    assert graphed.recorded == 1
+    assert all(torch.allclose(one, other, atol=1e-5) for one, other in zip(found, expected, strict=True))
 
 
 @pytest.mark.gpu
@@ -355,23 +269,23 @@ def test_graphs_on_a_gpu_give_what_the_network_gives_for_changing_inputs_and_sha
     for seed, vertices in enumerate((70, 70, 70, 50, 50, 30, 30, 70, 70, 70)):
         meshes = on_gpu(seed, vertices)
         assert torch.allclose(graphed(**meshes), network(**meshes), atol=1e-5)
-    assert is_replayed(network)
+    assert graphed.recorded
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", ["float32", "bfloat16"])
 @torch.no_grad()
 def test_a_graph_sees_weights_that_change_in_place_and_weights_that_are_replaced(
-    network: nn.Module, name: acceleration.Precision
+    network: nn.Module, name: execution.Precision
 ) -> None:
     network = network.cuda()
-    graphed, plain = GraphedTransfer(network, precision=name), GraphedTransfer(network, precision=name, kept=0)
+    graphed = GraphedTransfer(network, precision=name)
 
     def check() -> Tensor:
         outputs = [graphed(**on_gpu(seed)) for seed in range(4)]
-        assert is_replayed(network)
+        assert graphed.recorded
         for seed, output in enumerate(outputs):
-            assert torch.allclose(output, plain._run(**on_gpu(seed)), atol=1e-5 if name == "float32" else 1e-3)
+            assert torch.allclose(output, in_precision(network, name, seed), atol=1e-5 if name == "float32" else 1e-3)
         return outputs[0]
 
     first = check()
@@ -386,16 +300,16 @@ def test_a_graph_sees_weights_that_change_in_place_and_weights_that_are_replaced
 @pytest.mark.parametrize("name", ["float32", "bfloat16"])
 @torch.no_grad()
 def test_a_graph_recorded_or_replayed_under_autocast_computes_in_its_own_precision(
-    network: nn.Module, name: acceleration.Precision
+    network: nn.Module, name: execution.Precision
 ) -> None:
     network = network.cuda()
     graphed = GraphedTransfer(network, precision=name)
-    expected = [graphed._run(**on_gpu(seed)) for seed in range(5)]
+    expected = [in_precision(network, name, seed) for seed in range(5)]
     close = 1e-5 if name == "float32" else 1e-3
     with torch.autocast("cuda", torch.bfloat16):
         network(**on_gpu(9))  # autocast keeps rounded weights from here to the end of the block
         inside = [graphed(**on_gpu(seed)) for seed in range(3)]
-    assert is_replayed(network)
+    assert graphed.recorded
     outside = [graphed(**on_gpu(seed)) for seed in range(3, 5)]
     for found, known in zip(inside + outside, expected, strict=True):
         assert torch.allclose(found, known, atol=close)
@@ -412,7 +326,7 @@ def test_a_compiled_network_is_replayed_on_a_gpu() -> None:
     graphed = GraphedTransfer(twin)
     for seed in range(4):
         assert torch.allclose(graphed(**on_gpu(seed)), network(**on_gpu(seed)), atol=1e-5)
-    assert is_replayed(twin)
+    assert graphed.recorded
 
 
 def test_inference_in_bfloat16_is_that_of_training_up_to_rounding() -> None:

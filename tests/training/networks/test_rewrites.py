@@ -9,11 +9,20 @@ from torch.nn.functional import conv1d, instance_norm, linear
 
 from tests.literal.corenet3d import LiteralElaIN
 from tests.literal.dsffnet import LiteralNorm
-from tests.support.three_networks import FORMS, LITERAL, lively, meshes, pair
+from tests.support.three_networks import lively, meshes
 from training.networks.dsffnet import DSFFNet, _joined
+from training.networks.layers import modulation
 from training.networks.layers.elain import ElaIN, Generator, Identity, centred
-from training.networks.layers.modulation import FFAdaIN, affine_map, homogeneous, pose_probe, posed_map
-from training.networks.layers.pose_encoder import PoseEncoder, centred_features, normalised_linear
+from training.networks.layers.modulation import (
+    FFAdaIN,
+    affine_map,
+    homogeneous,
+    modulated_relu,
+    pose_probe,
+    posed_map,
+)
+from training.networks.layers.pose_encoder import PoseEncoder, centred_features, deviation_after, normalised_linear
+from training.networks.npt import quadratic_relu
 
 EXACT = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -115,8 +124,45 @@ def test_3d_corenets_wide_convolution_and_the_next_layer_are_one_map_of_nine_num
     torch.testing.assert_close(found.deviation, (expected.var(dim=1, keepdim=True) + 1e-5).sqrt(), **EXACT)
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize(("source", "target"), [(2, 7), (40, 2), (5, 60)])
-def test_few_vertices_give_what_the_equations_give(form: str, source: int, target: int) -> None:
-    network, inputs = lively(form).double().eval(), pair(form, source=source, target=target, dtype=torch.float64)
-    torch.testing.assert_close(network(**inputs), LITERAL[form](network)(**inputs), rtol=1e-8, atol=1e-8)
+@pytest.mark.parametrize("normalised", [True, False])
+def test_modulated_relu_has_the_derivative_of_its_equation(normalised: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modulation, "CHUNK_ELEMENTS", 30)
+    inputs = [torch.randn(shape, requires_grad=True) for shape in ((2, 9, 5), (2, 9, 4), (2, 4, 5), (2, 4, 5))]
+    hidden, vertices, scale, shift = inputs
+    assert torch.autograd.gradcheck(lambda *given: modulated_relu(*given, normalised=normalised), inputs)
+    normal = _by_channel(hidden) if normalised else hidden
+    expected = torch.relu(normal * (vertices @ scale) + vertices @ shift)
+    torch.testing.assert_close(modulated_relu(*inputs, normalised=normalised), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_deviation_after_has_the_derivative_of_its_equation() -> None:
+    weight = torch.randn(6, 4, requires_grad=True)
+    features = centred_features(torch.randn(2, 9, 4)).requires_grad_()
+    assert torch.autograd.gradcheck(deviation_after, (weight, features))
+    variance = (features @ weight.t()).var(dim=1, correction=0)
+    torch.testing.assert_close(deviation_after(weight, features), torch.rsqrt(variance + 1e-5))
+
+
+def test_a_mean_far_above_the_deviation_does_not_spoil_the_norm() -> None:
+    hidden = torch.randn(1, 500, 8, dtype=torch.float32) + 1e4  # neighbouring float32 numbers are 1e-3 apart there
+    ones, zeros = (torch.zeros(1, 4, 8, dtype=torch.float32) for _ in range(2))
+    ones[:, 3] = 1
+    vertices = homogeneous(torch.rand(1, 500, 3, dtype=torch.float32))
+    exact = modulated_relu(hidden.double(), vertices.double(), ones.double(), zeros.double())
+    torch.testing.assert_close(modulated_relu(hidden, vertices, ones, zeros).double(), exact, rtol=0, atol=1e-3)
+
+
+def test_a_channel_of_tiny_variance_keeps_its_scale() -> None:
+    common = torch.randn(1, 400, 1) * 100
+    features = torch.cat([common + 1e-1 * torch.randn(1, 400, 1), common], dim=2).float()
+    features = features - features.mean(dim=1, keepdim=True)
+    weight = torch.tensor([[1.0, -1.0]], dtype=torch.float32)
+    exact = deviation_after(weight.double(), features.double())
+    torch.testing.assert_close(deviation_after(weight, features).double(), exact, rtol=1e-5, atol=0)
+
+
+def test_quadratic_relu_is_its_equation() -> None:
+    vertices = homogeneous(_mesh(9))
+    line, scale, shift = (torch.randn(2, 4, 5) for _ in range(3))
+    expected = torch.relu((vertices @ line) * (vertices @ scale) + vertices @ shift)
+    torch.testing.assert_close(quadratic_relu(vertices, line, scale, shift), expected, rtol=1e-12, atol=1e-12)
