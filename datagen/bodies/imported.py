@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from datagen.bodies.imported_layouts import FoundMeshes, find_meshes
 from datagen.common.assets import Asset, file_asset
 from datagen.common.errors import BodyError, MeshError
-from datagen.common.files import read_bounded
+from datagen.common.files import sha256_of
 from datagen.mesh.files import load_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.limits import BYTE_LIMIT
@@ -137,7 +137,7 @@ def _digest(meshes: FoundMeshes) -> str:
     for cell in meshes.cells():
         path = meshes.files[cell]
         try:
-            content = hashlib.sha256(read_bounded(path, limit=BYTE_LIMIT)).hexdigest()
+            content = sha256_of(path, limit=BYTE_LIMIT)
         except OSError as error:
             raise BodyError(
                 f"{path} cannot be read ({error.strerror}). Mend its permissions or take it away"

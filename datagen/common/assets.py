@@ -1,11 +1,10 @@
 """What data was made from: packages and files, with licence and hash, so that the same bytes can be made again."""
 
-import errno
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.common.errors import BodyError
+from datagen.common.errors import BodyError, UnsafeFileError, reason_of
+from datagen.common.files import sha256_of
 
 
 @dataclass(frozen=True)
@@ -26,13 +25,10 @@ def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
         It cannot be read.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise OSError(errno.EINVAL, "it is no regular file")  # opening a pipe would wait
-        with open(path, "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
+        digest = sha256_of(path)
+    except (OSError, UnsafeFileError) as error:
         raise BodyError(
-            f"{path}, which the data is made from, cannot be read ({error.strerror or error}). Put it there, or name "
-            "another in the recipe"
+            f"{path}, which the data is made from, cannot be read ({reason_of(error)}). Put it there, or name another "
+            "in the recipe"
         ) from error
     return Asset(name or path.name, licence, f"sha256:{digest}")

@@ -22,14 +22,13 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from datagen.common.errors import DamagedFileError, UnsafeFileError, storage_errors
-from datagen.common.files import open_regular, read_within, resolve_within, sync_folder, write_atomically
+from datagen.common.files import open_regular, read_within, resolve_within, sha256_of, sync_folder, write_atomically
 from datagen.common.json_files import fault_in, warn_once
 from training.checkpoints.weights import About, about_in, write_weights
 
 WEIGHTS, AVERAGE, STATE, MANIFEST = "weights.safetensors", "average.safetensors", "state.pt", "manifest.json"
 BEST, LATEST = "best", "latest"
 _STEP = re.compile(r"step-\d{8,15}")
-_LARGEST = 8 * 2**30  # bytes of a file; weights of the widest network of the papers have 0.04 of it
 Writer = Callable[[Path], None]
 
 
@@ -230,23 +229,8 @@ def _is_marked_best(path: Path) -> bool:
         return False
 
 
-def sha256_of(path: Path) -> str:
-    """Return the sha256 of a regular file, read in pieces.
-
-    Raises
-    ------
-    UnsafeFileError
-        It is not a regular file, or longer than any: a file of holes takes no room, but hours to hash.
-    """
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > _LARGEST:
-            raise UnsafeFileError(f"{path} has {size:,} bytes, more than any file of a checkpoint")
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _sha256_once(path: Path) -> str:
-    """As _sha256, without reading again a file that looks as it did: forgetting would hash every checkpoint kept."""
+    """As sha256_of, without reading again a file that looks as it did: forgetting would hash every checkpoint kept."""
     status = path.stat()
     return _known_sha256(path, status.st_ino, status.st_mtime_ns, status.st_size)
 

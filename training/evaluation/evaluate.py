@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import EvaluationError, RecipeError
+from datagen.common.files import sha256_of
 from datagen.common.resources import bytes_text, free_memory
 from datagen.grid import PoseType
 from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
-from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of, sha256_of
+from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of
 from training.evaluation.measure import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
 from training.evaluation.method_names import method_name, needs_equal_counts
 from training.evaluation.results import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows

@@ -8,11 +8,12 @@ from typing import Any
 
 import torch
 
+from datagen.common.files import sha256_of
 from datagen.store import Dataset
 from datagen.store.verify import describe
 from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
-from training.checkpoints.folder import AVERAGE, WEIGHTS, sha256_of
+from training.checkpoints.folder import AVERAGE, WEIGHTS
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
 from training.networks import network_from
