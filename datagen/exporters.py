@@ -14,7 +14,7 @@ from datagen.common.errors import DatasetError, RecipeError, StorageError
 from datagen.common.files import write_atomically
 from datagen.grid import POSE_TYPES
 from datagen.mesh.files import save_mesh
-from datagen.mesh.formats.obj_fast import face_lines, vertex_lines
+from datagen.mesh.formats.obj import face_lines, vertex_lines
 from datagen.mesh.geometry import Mesh
 from datagen.store import Dataset
 

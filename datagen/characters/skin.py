@@ -1,14 +1,13 @@
 """The skins of a glTF file: joints, inverse bind matrices, and the triangles that they deform (3.7.2, 3.7.3)."""
 
 from dataclasses import dataclass, replace
-from itertools import count, takewhile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import BodyError
-from datagen.mesh.formats.gltf import FAN, STRIP, TRIANGLES, Gltf, triangles
+from datagen.mesh.formats.gltf import SOLID, TRIANGLES, Gltf, triangles
 
 
 @dataclass(frozen=True)
@@ -80,25 +79,17 @@ def _read_skins(file: Gltf) -> list[Skin]:
 def _skin(file: Gltf, number: int) -> Skin:
     skin = file.json["skins"][number]
     joints = tuple(skin["joints"])
-    inverse = np.tile(np.eye(4), (len(joints), 1, 1))
-    if "inverseBindMatrices" in skin:
-        columns = file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
-        inverse = columns.reshape(-1, 4, 4).transpose(0, 2, 1)
     meshes = [node["mesh"] for node in file.nodes if node.get("skin") == number and "mesh" in node]
     pieces = [piece for mesh in meshes for piece in file.json["meshes"][mesh]["primitives"]]
-    solid = [piece for piece in pieces if piece.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
-    return Skin(joints, inverse, tuple(_primitive(file, piece, len(joints)) for piece in solid))
+    solid = [piece for piece in pieces if piece.get("mode", TRIANGLES) in SOLID]
+    return Skin(joints, file.inverse_bind(skin), tuple(_primitive(file, piece, len(joints)) for piece in solid))
 
 
 def _primitive(file: Gltf, primitive: dict[str, Any], joint_count: int) -> Primitive:
     attributes = primitive["attributes"]
     positions = file.accessor(attributes["POSITION"]).astype(np.float64)
-    sets = list(takewhile(lambda each: f"JOINTS_{each}" in attributes and f"WEIGHTS_{each}" in attributes, count()))
-    if not sets:
-        raise BodyError(f"{file.path}: a skinned mesh has no weights. Bind it to its armature and export it again")
     corners = file.accessor(primitive["indices"]).ravel() if "indices" in primitive else np.arange(len(positions))
-    joints = np.concatenate([file.accessor(attributes[f"JOINTS_{each}"]) for each in sets], axis=1)
-    weights = np.concatenate([file.accessor(attributes[f"WEIGHTS_{each}"]) for each in sets], axis=1)
+    joints, weights = file.influences(attributes)
     _require_below(corners, len(positions), f"{file.path}: a face names vertex")
     _require_below(joints[weights != 0], joint_count, f"{file.path}: a vertex names joint")
     return Primitive(

@@ -9,38 +9,26 @@ Limits: files of up to 2,000,000 vertices and 1 GiB; polygons with more than thr
 all objects of an OBJ file are one mesh, as they share its vertices; glTF with compressed geometry is refused.
 """
 
-import io
 import os
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import BodyError, MeshError, StorageError
-from datagen.common.files import read_bounded, write_atomically
-from datagen.mesh.formats import FORMATS
-from datagen.mesh.formats.glb_export import built_draft, built_glb
-from datagen.mesh.formats.glb_writer import Draft
-from datagen.mesh.formats.obj import ObjContent
-from datagen.mesh.formats.obj_export import built_obj, one_word
-from datagen.mesh.formats.obj_fast import read_plain
-from datagen.mesh.formats.off_stl import OffContent, StlContent, built_off, built_stl
-from datagen.mesh.formats.ply import PlyContent, built
-from datagen.mesh.formats.surface import Content, Encoded, component_count
+from datagen.common.files import write_atomically
+from datagen.mesh.formats import format_of
+from datagen.mesh.formats.surface import Content, Encoded, one_word
 from datagen.mesh.geometry import Mesh, check_mesh
-from datagen.mesh.limits import BYTE_LIMIT, refuse_huge, require_file, require_known, require_thickness
+from datagen.mesh.limits import refuse_huge, require_file, require_known, require_thickness
 
-_TEXTS: dict[str, Callable[[bytes, Path], Content]] = {
-    ".obj": ObjContent,
-    ".ply": PlyContent,
-    ".off": OffContent,
-    ".stl": StlContent,
-}
+if TYPE_CHECKING:
+    from datagen.mesh.formats.glb_writer import Draft
+
 _DAMAGE = (
     LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
     np.linalg.LinAlgError,
@@ -60,14 +48,11 @@ class MeshFile:
     mesh
         ``vertices`` [n, 3] float64 as they lie in the file, in its own unit and axes (GLB: in world space);
         ``faces`` [f, 3] int64, polygons as fans of triangles.
-    components
-        Connected pieces of the mesh; vertices at one place count as connected.
     """
 
     path: Path
     name: str
     mesh: Mesh
-    components: int
     content: Content = field(repr=False)
 
 
@@ -82,11 +67,27 @@ def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile
         One line for whatever is wrong: no such file, unknown format, damage, no faces, numbers that are not finite,
         faces without vertices, no extent, no thickness, too many vertices, several geometries.
     """
-    path = Path(path)
+    read = _read(Path(path), geometry)
+    require_thickness(read.content.vertices, read.path)
+    return read
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read vertices and faces alone, as data sets have them, in the file's order; they may be flat.
+
+    Raises
+    ------
+    MeshError
+        The file is missing, of an unknown format, unreadable, or not one usable mesh.
+    """
+    return _read(Path(path), None).mesh
+
+
+def _read(path: Path, geometry: str | None) -> MeshFile:
     require_file(path)
     try:
         refuse_huge(path)
-        content = _content(path, geometry)
+        content = format_of(path.suffix.lower()).read(path, geometry)
         vertices, faces = content.vertices, _faces(content, path)
     except MeshError:
         raise
@@ -98,47 +99,11 @@ def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
     mesh = check_mesh(Mesh(vertices, faces), name=str(path))
-    require_thickness(vertices, path)
-    return MeshFile(path, content.name or path.stem, mesh, component_count(vertices, faces), content)
+    return MeshFile(path, content.name or path.stem, mesh, content)
 
 
 def _one_line(reason: object) -> str:
     return " ".join(str(reason).split())[:300]
-
-
-def _content(path: Path, geometry: str | None) -> Content:
-    if path.suffix.lower() == ".glb":
-        return _glb_content(path, geometry)
-    content = _TEXTS[path.suffix.lower()](read_bounded(path, limit=BYTE_LIMIT), path)
-    if geometry is not None:
-        raise MeshError(
-            f"{path} is one mesh as a whole; only a GLB has geometries to choose: save {geometry!r} by itself"
-        )
-    return content
-
-
-def _glb_content(path: Path, geometry: str | None) -> Content:
-    from datagen.mesh.formats.glb import (  # brings SciPy, which takes longer to import than to read
-        GlbContent,
-        GlbFile,
-        solid_nodes,
-    )
-
-    with path.open("rb") as file:
-        if file.read(4) != b"glTF":
-            raise ValueError("it does not begin with 'glTF' (a text, or a .gltf by another name?)")
-    scene = GlbFile(path)
-    nodes = solid_nodes(scene)
-    names = ", ".join(repr(name) for name in nodes)
-    if not nodes:
-        raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); pose transfer needs a mesh")
-    if geometry is not None and geometry not in nodes:
-        raise MeshError(f"{path} has no geometry {geometry!r}; it has {names}")
-    if geometry is None and len(nodes) > 1:
-        how = "--source-geometry NAME or --target-geometry NAME"
-        raise MeshError(f"{path} holds {len(nodes)} geometries: {names}. Choose one with {how}")
-    name = geometry or next(iter(nodes))
-    return GlbContent(scene, name, nodes[name])
 
 
 def _faces(content: Content, path: Path) -> NDArray[np.int64]:
@@ -154,32 +119,6 @@ def _faces(content: Content, path: Path) -> NDArray[np.int64]:
     return surface.faces
 
 
-def posed_bytes(original: MeshFile, vertices: NDArray[np.floating], suffix: str) -> bytes:
-    """The original with other vertices [n, 3], as a file of the format of ``suffix``, without files beside it.
-
-    Raises
-    ------
-    MeshError
-        Unknown suffix, or vertices that are not the original's in number or not finite.
-    """
-    return _encoded(original, vertices, suffix.lower(), None).content
-
-
-def _encoded(original: MeshFile, vertices: NDArray[np.floating], suffix: str, stem: str | None) -> Encoded:
-    require_known(Path(f"mesh{suffix}"))
-    positions = usable(original, vertices)
-    if suffix == original.path.suffix.lower():
-        return original.content.rewritten(positions)
-    surface = original.content.surface
-    if suffix == ".obj":
-        made = built_obj(surface, positions, original.name, stem)
-    elif suffix == ".glb":
-        made = built_glb(surface, positions, original.name)
-    else:
-        made = {".ply": built, ".off": built_off, ".stl": built_stl}[suffix](surface, positions)
-    return Encoded(made.content, made.beside, [*made.left_out, *original.content.only_here])
-
-
 def usable(original: MeshFile, vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """Posed vertices [n, 3] as float64; MeshError where they are not the original's in number, or not finite."""
     found = np.asarray(vertices, np.float64)
@@ -193,11 +132,12 @@ def usable(original: MeshFile, vertices: NDArray[np.floating]) -> NDArray[np.flo
     return found
 
 
-def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path) -> list[str]:
+def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *, beside: bool = True) -> list[str]:
     """Write the original with other vertices [n, 3]; the file appears whole or not at all. The suffix tells the format.
 
     Normals are made anew where the file has them. Materials and textures are copied beside an OBJ or PLY file that goes
-    to another folder; a different file of that name is left alone, unless it is called after ``out``.
+    to another folder; a different file of that name is left alone, unless it is called after ``out``. With ``beside``
+    False nothing is written but the file.
 
     Returns
     -------
@@ -212,17 +152,22 @@ def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path) -
         The file could not be written.
     """
     out = Path(out)
-    made = _encoded(original, vertices, out.suffix.lower(), out.stem)
-    notes = list(made.left_out)
-    beside = dict(made.beside)
-    if out.suffix.lower() == original.path.suffix.lower() and _folder(out) != _folder(original.path):
-        along = original.content.companions()
-        beside |= along.beside
-        notes += along.left_out
-    for name, content in beside.items():
-        notes += _write_beside(out, name, content)
+    require_known(out)
+    made = _encoded(original, usable(original, vertices), out)
+    for name, content in made.beside.items() if beside else ():
+        made.left_out.extend(_write_beside(out, name, content))
     write_atomically(out, made.content)
-    return list(dict.fromkeys(notes))
+    return list(dict.fromkeys(made.left_out))
+
+
+def _encoded(original: MeshFile, vertices: NDArray[np.float64], out: Path) -> Encoded:
+    suffix, content = out.suffix.lower(), original.content
+    if suffix != original.path.suffix.lower():
+        made = format_of(suffix).build(content.surface, vertices, original.name, out.stem)
+        return Encoded(made.content, made.beside, [*made.left_out, *content.only_here])
+    made = content.rewritten(vertices)
+    along = content.companions() if _folder(out) != _folder(original.path) else Encoded(b"")
+    return Encoded(made.content, along.beside, [*made.left_out, *along.left_out])
 
 
 def _folder(path: Path) -> Path:
@@ -240,9 +185,10 @@ def _write_beside(out: Path, name: str, content: bytes) -> list[str]:
     return []
 
 
-def draft_of(original: MeshFile) -> Draft:
+def draft_of(original: MeshFile) -> "Draft":
     """The original as a GLB file that lacks only its positions."""
     from datagen.mesh.formats.glb import GlbContent
+    from datagen.mesh.formats.glb_export import built_draft
 
     if isinstance(original.content, GlbContent):
         return original.content.draft()
@@ -271,58 +217,6 @@ def check_writable(out: Path) -> None:
         raise StorageError(f"the folder {out.parent} cannot be written to: choose another place for {out.name}")
 
 
-def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh file, keeping its vertex order (nothing is merged or reordered).
-
-    Raises
-    ------
-    MeshError
-        The file is missing, of an unknown format, unreadable, or not one usable triangle mesh.
-    """
-    from datagen.mesh.limits import BYTE_LIMIT, refuse_huge, require_file
-
-    path = Path(path)
-    require_file(path)
-    try:
-        refuse_huge(path)
-        content = read_bounded(path, limit=BYTE_LIMIT)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
-    return check_mesh(_single_geometry(path, content), name=str(path))
-
-
-def _single_geometry(path: Path, content: bytes) -> Mesh:
-    import trimesh
-
-    is_obj = path.suffix.lower() == ".obj"
-    try:
-        plain = read_plain(content) if is_obj else None
-        if plain:
-            return Mesh(*plain)
-        source = io.BytesIO(_plain_obj(content) if is_obj else content)  # no path: trimesh would read what a file names
-        scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, maintain_order=True)
-        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    except Exception as error:  # trimesh's readers raise whatever their parsers raise
-        raise MeshError(f"{path} cannot be read as a {path.suffix[1:].upper()} mesh: {error}") from error
-    if len(parts) > 1:
-        raise MeshError(f"{path} holds {len(parts)} separate meshes; save the one to use as a file of its own")
-    if not parts:
-        raise MeshError(f"{path} holds no triangles (a point cloud, or an empty file?)")
-    return Mesh(np.asarray(parts[0].vertices, np.float64), np.asarray(parts[0].faces, np.int64))
-
-
-def _plain_obj(content: bytes) -> bytes:
-    """Positions and faces of an OBJ file. Materials, groups and texture seams would split its one list of vertices."""
-    kept = []
-    for line in content.replace(b"\\\n", b" ").splitlines():
-        words = line.split()
-        if words and words[0] == b"v":
-            kept.append(line)
-        elif words and words[0] == b"f":
-            kept.append(b" ".join([b"f", *(word.split(b"/")[0] for word in words[1:])]))
-    return b"\n".join(kept) + b"\n"
-
-
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
     """Write a mesh; the format is the file name's. The file appears whole or not at all.
 
@@ -334,8 +228,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         The file could not be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+    require_known(path)
     import trimesh
 
     exported: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=path.suffix[1:].lower())

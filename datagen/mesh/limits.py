@@ -4,15 +4,16 @@ import json
 import os
 import struct
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError
 from datagen.mesh.formats import FORMATS
-from datagen.mesh.formats.off_stl import is_binary_stl
-from datagen.mesh.formats.ply_header import read_header
+
+if TYPE_CHECKING:
+    from datagen.mesh.formats.ply_header import Header
 
 VERTEX_LIMIT = 2_000_000
 """Vertices of a mesh at most; bodies for animation have a thousandth of it. What they take: docs/transfer.md."""
@@ -52,8 +53,19 @@ def refuse_huge(path: Path) -> None:
 
 def _is_text(beginning: bytes, suffix: str, size: int) -> bool:
     if suffix == ".ply":
-        return read_header(beginning).form == "ascii"
+        return _ply_header(beginning).form == "ascii"
     return suffix != ".glb" and not (suffix == ".stl" and is_binary_stl(beginning[:84], size))
+
+
+def _ply_header(beginning: bytes) -> "Header":
+    from datagen.mesh.formats.ply_header import read_header
+
+    return read_header(beginning)
+
+
+def is_binary_stl(beginning: bytes, size: int) -> bool:
+    """Whether an STL file of that size with that beginning (84 bytes) is binary: the length decides, texts vary."""
+    return len(beginning) >= 84 and size == 84 + 50 * int.from_bytes(beginning[80:84], "little")
 
 
 def _refuse_long_text(file: IO[bytes], path: Path) -> None:
@@ -95,7 +107,7 @@ def _in_obj(file: IO[bytes], size: int) -> int:
 
 
 def _in_ply(file: IO[bytes], size: int) -> int:
-    header = read_header(file.read(_BLOCK))
+    header = _ply_header(file.read(_BLOCK))
     others = sum(element.count for element in header.elements if element.name != "vertex")
     return max(header.count("vertex"), others // 4)
 

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, storage_errors
-from datagen.common.files import write_atomically
 from datagen.common.printable import printable
-from datagen.mesh.files import MeshFile, posed_bytes, write_posed
+from datagen.mesh.files import MeshFile, write_posed
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import remarks, seen_by
@@ -107,15 +106,13 @@ class TransferWork:
         """The frames, each written to its file as it passes."""
         for number, posed in enumerate(self._posed()):
             place = folder / self.job.frame_file(self.job.sources[number]).name
-            if number:  # what lies beside the first lies beside all
-                write_atomically(place, posed_bytes(self.target, posed.vertices, place.suffix))
-            else:
-                self._write_posed(posed, place)
+            self._write_posed(posed, place, beside=not number)  # what lies beside the first lies beside all
             yield posed
 
-    def _write_posed(self, posed: Mesh, out: Path) -> None:
-        for lost in write_posed(self.target, posed.vertices, out):
-            warn(lost)
+    def _write_posed(self, posed: Mesh, out: Path, *, beside: bool = True) -> None:
+        lost = write_posed(self.target, posed.vertices, out, beside=beside)
+        for line in lost if beside else ():
+            warn(line)
 
     def _posed(self) -> Iterator[Mesh]:
         """The output of every frame; those that the picture shows are kept."""

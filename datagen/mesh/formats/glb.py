@@ -10,31 +10,44 @@ import base64
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import count, takewhile
+from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import UnsafeFileError
+from datagen.common.errors import MeshError, UnsafeFileError
 from datagen.common.files import read_bounded, resolve_within
+from datagen.mesh.formats.glb_export import built_glb
 from datagen.mesh.formats.glb_writer import Block, Draft, GlbParts, Json
-from datagen.mesh.formats.gltf import LARGEST, Gltf, triangles
-from datagen.mesh.formats.surface import Encoded, Image, Material, Surface, numbered, srgb
+from datagen.mesh.formats.gltf import LARGEST, SOLID, Gltf, triangles
+from datagen.mesh.formats.surface import Encoded, Format, Image, Material, Surface, numbered, srgb
 from datagen.mesh.limits import require_counts
 
-SOLID = (4, 5, 6)
-"""Modes of primitives with faces: triangles, strips, fans."""
 
+def read_glb(path: Path, geometry: str | None) -> "GlbContent":
+    """Read one mesh of a scene: the one called ``geometry``, or the only one.
 
-class GlbFile(Gltf):
-    """A glTF file whose buffer views can be had as bytes."""
-
-    def view(self, number: int) -> bytes:
-        """The bytes of a buffer view."""
-        return self._elements(
-            number, 0, np.dtype(np.uint8), self.json["bufferViews"][number]["byteLength"], 1
-        ).tobytes()
+    Raises
+    ------
+    MeshError
+        There are no faces, no such geometry, or several to choose from.
+    """
+    with path.open("rb") as beginning:
+        if beginning.read(4) != b"glTF":
+            raise ValueError("it does not begin with 'glTF' (a text, or a .gltf by another name?)")
+    scene = Gltf(path)
+    nodes = solid_nodes(scene)
+    names = ", ".join(map(repr, nodes))
+    if not nodes:
+        raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); pose transfer needs a mesh")
+    if geometry is not None and geometry not in nodes:
+        raise MeshError(f"{path} has no geometry {geometry!r}; it has {names}")
+    if geometry is None and len(nodes) > 1:
+        how = "--source-geometry NAME or --target-geometry NAME"
+        raise MeshError(f"{path} holds {len(nodes)} geometries: {names}. Choose one with {how}")
+    name = geometry or next(iter(nodes))
+    return GlbContent(scene, name, nodes[name])
 
 
 def solid_nodes(file: Gltf) -> dict[str, int]:
@@ -49,7 +62,7 @@ def solid_nodes(file: Gltf) -> dict[str, int]:
     return found
 
 
-def base_texture(file: GlbFile, number: int) -> Json:
+def base_texture(file: Gltf, number: int) -> Json:
     """How a material names the texture of its base colour; nothing for no material."""
     materials = file.json.get("materials", [])
     if not 0 <= number < len(materials):
@@ -57,7 +70,7 @@ def base_texture(file: GlbFile, number: int) -> Json:
     return materials[number].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
 
 
-def read_material(file: GlbFile, number: int) -> Material:
+def read_material(file: Gltf, number: int) -> Material:
     """Name, base colour and its texture."""
     material = file.json["materials"][number]
     look = material.get("pbrMetallicRoughness", {})
@@ -69,20 +82,20 @@ def read_material(file: GlbFile, number: int) -> Material:
     return Material(str(material.get("name") or f"material_{number}"), (red, green, blue, alpha), image)
 
 
-def _image(file: GlbFile, number: int) -> Image | None:
+def _image(file: Gltf, number: int) -> Image | None:
     image = file.json["images"][number]
     content = image_bytes(file, image)
     return Image(str(image.get("name") or f"image_{number}"), content) if content is not None else None
 
 
-def image_bytes(file: GlbFile, image: Json) -> bytes | None:
+def image_bytes(file: Gltf, image: Json) -> bytes | None:
     """The bytes of an image inside the file, or in a file beside it; None where they are nowhere."""
     content = _image_content(file, image)
     file.require_room(("image", id(image)), len(content or b""))
     return content
 
 
-def _image_content(file: GlbFile, image: Json) -> bytes | None:
+def _image_content(file: Gltf, image: Json) -> bytes | None:
     if "bufferView" in image:
         return file.view(image["bufferView"])
     uri = str(image.get("uri", ""))
@@ -111,7 +124,7 @@ class Piece:
 class GlbContent:
     """One mesh of a GLB file."""
 
-    def __init__(self, file: GlbFile, name: str, node: int) -> None:
+    def __init__(self, file: Gltf, name: str, node: int) -> None:
         self.name: str | None = name
         self._file, self._node_number, self._node = file, node, file.nodes[node]
         self._mesh = file.json["meshes"][self._node["mesh"]]
@@ -177,19 +190,11 @@ class GlbContent:
     def _skinned(self, local: NDArray[np.float64], attributes: Json) -> NDArray[np.float64]:
         """Positions as the skin shows them at rest; the node's own transform does not matter then (3.7.3.3)."""
         skin = self._file.json["skins"][self._node["skin"]]
-        joints = self._file.world[skin["joints"]]
-        if "inverseBindMatrices" in skin:
-            inverse = self._file.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
-            joints = joints @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)
-        sets = takewhile(lambda number: f"JOINTS_{number}" in attributes, count())
-        names = [(f"JOINTS_{number}", f"WEIGHTS_{number}") for number in sets]
-        numbers = np.concatenate([self._file.accessor(attributes[name]) for name, _ in names], axis=1).astype(np.int64)
-        weights = np.concatenate([self._file.accessor(attributes[name]) for _, name in names], axis=1).astype(
-            np.float64
-        )
-        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+        joints = self._file.world[skin["joints"]] @ self._file.inverse_bind(skin)
+        numbers, weights = self._file.influences(attributes)
+        weights = weights / np.maximum(weights.astype(np.float64).sum(axis=1, keepdims=True), 1e-12)
         total = np.zeros_like(local)
-        for number, weight in zip(numbers.T, weights.T, strict=True):
+        for number, weight in zip(numbers.astype(np.int64).T, weights.T, strict=True):
             matrices = joints[number]
             total += weight[:, None] * (np.einsum("vij,vj->vi", matrices[:, :3, :3], local) + matrices[:, :3, 3])
         return total
@@ -323,3 +328,6 @@ _REBUILT = ("accessors", "bufferViews", "buffers", "skins", "animations", "meshe
 
 def _moved(positions: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return positions @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+FORMATS = {".glb": Format(read_glb, built_glb)}

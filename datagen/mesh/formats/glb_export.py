@@ -7,7 +7,7 @@ from datagen.mesh.formats.glb_writer import Block, Draft, GlbParts, Json
 from datagen.mesh.formats.surface import Encoded, Material, Surface, linear, numbered
 
 
-def built_glb(surface: Surface, vertices: NDArray[np.float64], name: str) -> Encoded:
+def built_glb(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
     """A GLB file of one node. Without normals in the original its shading is smooth: viewers show facets else."""
     draft, left_out = built_draft(surface, len(vertices), name)
     return Encoded(draft.static(vertices), {}, left_out)

@@ -12,6 +12,7 @@ import struct
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -129,6 +130,36 @@ class Gltf:
         with reading(self.path, f"accessor {number}"):
             return self._accessor(number)
 
+    def view(self, number: int) -> bytes:
+        """Return the bytes of a buffer view."""
+        length = self.json["bufferViews"][number]["byteLength"]
+        return self._elements(number, 0, np.dtype(np.uint8), length, 1).tobytes()
+
+    def inverse_bind(self, skin: Json) -> NDArray[np.float64]:
+        """Return the inverse bind matrices [joint, 4, 4] of a skin (3.7.3); identity where it has none."""
+        joints = len(skin["joints"])
+        if "inverseBindMatrices" not in skin:
+            return np.tile(np.eye(4), (joints, 1, 1))
+        columns = self.accessor(skin["inverseBindMatrices"])[:joints].astype(np.float64)
+        return columns.reshape(-1, 4, 4).transpose(0, 2, 1)
+
+    def influences(self, attributes: Json) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return joints and weights [vertex, influence] of a primitive, all of its sets side by side (3.7.3.3).
+
+        Raises
+        ------
+        BodyError
+            It has none.
+        """
+        sets = list(takewhile(lambda each: {f"JOINTS_{each}", f"WEIGHTS_{each}"} <= attributes.keys(), count()))
+        if not sets:
+            raise BodyError(f"{self.path}: a skinned mesh has no weights. Bind it to its armature and export it again")
+        joints, weights = (
+            np.concatenate([self.accessor(attributes[f"{what}_{each}"]) for each in sets], axis=1)
+            for what in ("JOINTS", "WEIGHTS")
+        )
+        return joints, weights
+
     def require_room(self, what: Hashable, size: int) -> None:
         """Count bytes that are taken out of the file, once for each ``what``: many entries may name the same ones.
 
@@ -147,12 +178,12 @@ class Gltf:
 
     def _accessor(self, number: int) -> NDArray[Any]:
         accessor = self.json["accessors"][number]
-        kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
-        self.require_room(("accessor", number), count * width * kind.itemsize)
+        kind, width, size = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
+        self.require_room(("accessor", number), size * width * kind.itemsize)
         if "bufferView" in accessor:
-            values = self._elements(accessor["bufferView"], accessor.get("byteOffset", 0), kind, count, width)
+            values = self._elements(accessor["bufferView"], accessor.get("byteOffset", 0), kind, size, width)
         else:
-            values = np.zeros((count, width), kind)
+            values = np.zeros((size, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
             where, what = sparse["indices"], sparse["values"]
@@ -271,7 +302,7 @@ def _frame(node: Json) -> NDArray[np.float64]:
     return np.array(node["matrix"], np.float64).reshape(4, 4).T[:3, :3]
 
 
-TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIANGLES, STRIP, FAN = SOLID = (4, 5, 6)
 """Modes of a primitive with faces (3.7.2.1)."""
 
 

@@ -1,22 +1,27 @@
-"""OBJ files as a person has them: the text is kept, and only positions and normals in it are written anew.
+"""OBJ files: the text is kept, and only positions and normals in it are written anew.
 
 So materials, groups, smoothing groups, quads, vertex colours, comments and the order of everything stay as they are.
 Lines that go on in the next are joined; names may be of any 8-bit encoding. Free-form surfaces are kept, not posed.
+
+Data sets of pose transfer are tens of thousands of files of bare vertices and triangles: those are read whole by NumPy,
+line by line only what is not so regular.
 """
 
 import re
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh.formats.mtl import LibraryFiles, read_library
-from datagen.mesh.formats.surface import Encoded, Surface, numbers, shared_normals
+from datagen.mesh.formats.surface import Encoded, Format, Surface, numbers, numbers_in, one_mesh, shared_normals
+
+if TYPE_CHECKING:
+    from datagen.mesh.formats.mtl import LibraryFiles
 
 _PATTERNS = {
-    (0,): re.compile(rb"\s*f(?:\s+-?\d+)+\s*"),
     (0, 1): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+)+\s*"),
     (0, 2): re.compile(rb"\s*f(?:\s+-?\d+//-?\d+)+\s*"),
     (0, 1, 2): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+/-?\d+)+\s*"),
@@ -35,9 +40,14 @@ class ObjContent:
         self._break = b"\n" if b"\n" in text or b"\r" not in text else b"\r"
         self._lines = text.split(self._break)
         self._at: dict[bytes, list[int]] = {element: [] for element in _ELEMENTS}
+        vertices, faces = self._at[b"v"], self._at[b"f"]
         for number, line in enumerate(self._lines):
-            words = line.split(None, 1)
-            if words and words[0] in self._at:
+            start = line[:2]
+            if start == b"v ":
+                vertices.append(number)
+            elif start == b"f ":
+                faces.append(number)
+            elif (words := line.split(None, 1)) and words[0] in self._at:
                 self._at[words[0]].append(number)
         self.vertices = self._numbers(b"v", 3, needed=3)
 
@@ -56,9 +66,7 @@ class ObjContent:
     @cached_property
     def _face_corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Numbers [corner, 3] of vertex, texture coordinate and normal (-1 for none), and corners of each face."""
-        lines = self._of(b"f")
-        sizes = np.array([len(_words(line)) - 1 for line in lines], np.int64)
-        table = _written_corners(lines)
+        table, sizes = _corners(self._of(b"f"))
         line_of = np.repeat(np.array(self._at[b"f"], np.int64), sizes)
         for column, element in enumerate((b"v", b"vt", b"vn")):
             before = np.searchsorted(np.array(self._at[element], np.int64), line_of)
@@ -137,10 +145,10 @@ class ObjContent:
         return Encoded(self._break.join(line for line in lines if line is not None))
 
     def _position_lines(self, vertices: NDArray[np.float64]) -> list[bytes]:
-        numbers = ("v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())).encode().splitlines()
+        written = vertex_lines(vertices).encode().splitlines()
         rest = [[*line.split(None, 4), b""][4] for line in self._of(b"v")]
         end = self._end
-        return [b"%b %b" % (line, tail) if tail else line + end for line, tail in zip(numbers, rest, strict=True)]
+        return [b"%b %b" % (line, tail) if tail else line + end for line, tail in zip(written, rest, strict=True)]
 
     @property
     def _end(self) -> bytes:
@@ -172,7 +180,9 @@ class ObjContent:
         return Encoded(b"", self._libraries.beside, self._libraries.missing)
 
     @cached_property
-    def _libraries(self) -> LibraryFiles:
+    def _libraries(self) -> "LibraryFiles":
+        from datagen.mesh.formats.mtl import read_library
+
         return read_library(self._path.parent, self._names(b"mtllib"))
 
     def _of(self, element: bytes) -> list[bytes]:
@@ -183,7 +193,11 @@ class ObjContent:
 
     def _numbers(self, element: bytes, columns: int, *, needed: int) -> NDArray[np.float64]:
         """The first numbers [line, column] of the lines of an element; 0 where a line has fewer."""
-        rows = [_words(line)[1 : columns + 1] for line in self._of(element)]
+        lines = self._of(element)
+        table = _regular_rows(lines, element)
+        if table is not None and table.shape[1] >= columns:
+            return np.ascontiguousarray(table[:, :columns])
+        rows = [_words(line)[1 : columns + 1] for line in lines]
         try:
             if any(len(row) < needed for row in rows):
                 raise ValueError
@@ -218,8 +232,29 @@ def _normal_line(normal: list[float]) -> bytes:
     return b"vn %.6f %.6f %.6f" % tuple(normal)
 
 
+def _regular_rows(lines: list[bytes], element: bytes) -> NDArray[np.float64] | None:
+    """Numbers [line, column] where all lines have equally many, else None; a NaN marks where a line begins."""
+    with suppress(ValueError):
+        table = numbers_in(b"\n".join(lines).replace(element, b"nan ")).reshape(len(lines), -1)
+        if np.isnan(table[:, :1]).all() and table.shape[1] > 1:
+            return table[:, 1:]
+    return None
+
+
+def _corners(lines: list[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers [corner, 3] as they are written, 0 where there is none, and corners [line] of each face."""
+    with suppress(ValueError):  # anything but vertices alone
+        written = numbers_in(b"\n".join(lines).replace(b"f", b" 0 "), np.int64)
+        starts = np.flatnonzero(written == 0)  # no vertex has this number
+        if len(starts) == len(lines):
+            table = np.zeros((len(written) - len(lines), 3), np.int64)
+            table[:, 0] = written[written != 0]
+            return table, np.diff(starts, append=len(written)) - 1
+    return _written_corners(lines), np.array([len(_words(line)) - 1 for line in lines], np.int64)
+
+
 def _written_corners(lines: list[bytes]) -> NDArray[np.int64]:
-    """Numbers [corner, 3] as they are written, 0 where there is none. Files hold one form of corner, as a rule."""
+    """The same of faces with texture coordinates or normals; files hold one form of corner, as a rule."""
     bare = [line.partition(b"#")[0] if b"#" in line else line for line in lines]
     for columns, pattern in _PATTERNS.items():
         if bare and all(map(pattern.fullmatch, bare)):
@@ -230,3 +265,25 @@ def _written_corners(lines: list[bytes]) -> NDArray[np.int64]:
             return table
     corners = [[*word.split(b"/"), b"", b""][:3] for line in bare for word in line.split()[1:]]
     return np.array([[int(part or b"0") for part in corner] for corner in corners], np.int64).reshape(-1, 3)
+
+
+def vertex_lines(vertices: NDArray[np.floating]) -> str:
+    """Return vertices [vertex, 3] as lines of a file, with nine significant digits: as many as tell all float32 apart.
+
+    So what is read back is the same number bit for bit; with the six or eight decimals that are common it is not.
+    """
+    return "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())
+
+
+def face_lines(faces: NDArray[np.integer]) -> str:
+    """Return triangles [face, 3] as lines of a file, which counts vertices from 1."""
+    return "f %d %d %d\n" * len(faces) % tuple((faces.ravel().astype(np.int64) + 1).tolist())
+
+
+def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
+    from datagen.mesh.formats.obj_export import built_obj
+
+    return built_obj(surface, vertices, name, stem)
+
+
+FORMATS = {".obj": Format(one_mesh(ObjContent), _built)}

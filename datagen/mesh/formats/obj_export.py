@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.mesh.formats.mtl import library_text
-from datagen.mesh.formats.surface import Encoded, Image, Material, Surface, numbered, shared_normals
+from datagen.mesh.formats.obj import vertex_lines
+from datagen.mesh.formats.surface import Encoded, Image, Material, Surface, numbered, one_word, shared_normals
 
 _SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg"}
 
@@ -18,7 +19,7 @@ def built_obj(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
     materials = _told_apart(surface.materials) if stem else ()
     images = _images(materials, stem) if stem else {}
     lines = [f"mtllib {stem}.mtl"] if materials else []
-    lines += [f"o {one_word(name)}", *_vertex_lines(vertices, surface.colours)]
+    lines += [f"o {one_word(name)}", *_coloured_lines(vertices, surface.colours)]
     columns: list[NDArray[np.int64] | None] = [surface.corners, None, None]
     if surface.uvs is not None:
         columns[1], rows = _distinct(surface.uvs)
@@ -32,11 +33,6 @@ def built_obj(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
         text = library_text(materials, {material: file for material, (file, _) in images.items()})
         beside[f"{stem}.mtl"] = text.encode()
     return Encoded("\n".join([*lines, ""]).encode(), beside, [] if stem or not surface.materials else ["materials"])
-
-
-def one_word(name: str) -> str:
-    """A name as OBJ and MTL files can hold it: without spaces, and not empty."""
-    return re.sub(r"\s+", "_", name.strip()) or "mesh"
 
 
 def _told_apart(materials: tuple[Material, ...]) -> tuple[Material, ...]:
@@ -66,11 +62,11 @@ def _plain_suffix(name: str) -> str:
     return suffix if re.fullmatch(r"\.\w{1,8}", suffix, re.ASCII) else ""
 
 
-def _vertex_lines(vertices: NDArray[np.float64], colours: NDArray[np.uint8] | None) -> Iterator[str]:
+def _coloured_lines(vertices: NDArray[np.float64], colours: NDArray[np.uint8] | None) -> list[str]:
     if colours is None:
-        return ("v {:.9g} {:.9g} {:.9g}".format(*row) for row in vertices.tolist())
+        return vertex_lines(vertices).splitlines()
     rows = np.concatenate([vertices, colours[:, :3] / 255], axis=1)
-    return ("v {:.9g} {:.9g} {:.9g} {:.4f} {:.4f} {:.4f}".format(*row) for row in rows.tolist())
+    return ["v {:.9g} {:.9g} {:.9g} {:.4f} {:.4f} {:.4f}".format(*row) for row in rows.tolist()]
 
 
 def _distinct(rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh.formats.surface import Encoded, Surface, numbered, numbers, shared_normals, unit
+from datagen.mesh.formats.surface import Encoded, Format, Surface, numbered, numbers, one_mesh, shared_normals, unit
+from datagen.mesh.limits import is_binary_stl
 
 _STL_HEADER = 80
 _ROWS_AT_ONCE = 2**16
@@ -92,7 +93,7 @@ def _colours(rows: list[list[bytes]]) -> NDArray[np.uint8] | None:
     return np.rint(np.clip(np.concatenate([values, opaque], axis=1), 0, 255)).astype(np.uint8)
 
 
-def built_off(surface: Surface, vertices: NDArray[np.float64]) -> Encoded:
+def _built_off(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
     """An OFF file: polygons, and colours of vertices (COFF)."""
     coloured = surface.colours is not None
     rows: list[list[Any]] = vertices.tolist()
@@ -149,12 +150,6 @@ class StlContent:
         return Encoded(b"")
 
 
-def is_binary_stl(beginning: bytes, size: int) -> bool:
-    """Whether a file of that size with that beginning (84 bytes) is binary: the length decides, texts vary."""
-    head = _STL_HEADER + 4
-    return len(beginning) >= head and size == head + 50 * int.from_bytes(beginning[_STL_HEADER:head], "little")
-
-
 def _text_corners(content: bytes) -> NDArray[np.float64]:
     if b"endsolid" not in content:
         raise ValueError("it ends before its solid does")
@@ -186,7 +181,7 @@ def _stl_bytes(at: NDArray[np.float64], header: bytes, attribute: NDArray[Any] |
     return header.ljust(_STL_HEADER, b"\0") + len(at).to_bytes(4, "little") + triangles.tobytes()
 
 
-def built_stl(surface: Surface, vertices: NDArray[np.float64]) -> Encoded:
+def _built_stl(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
     """A binary STL file: triangles and nothing else."""
     parts = {
         "texture coordinates": surface.uvs, "materials": surface.materials or None, "normals": surface.shading,
@@ -195,3 +190,6 @@ def built_stl(surface: Surface, vertices: NDArray[np.float64]) -> Encoded:
     left_out = ["shared vertices: each triangle has its own corners"]
     left_out += [name for name, part in parts.items() if part is not None]
     return Encoded(_stl_bytes(vertices[surface.faces], b"binary STL", 0), {}, left_out)
+
+
+FORMATS = {".off": Format(one_mesh(OffContent), _built_off), ".stl": Format(one_mesh(StlContent), _built_stl)}

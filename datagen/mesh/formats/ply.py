@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from datagen.mesh.formats.mtl import NamedFiles, texture_beside
 from datagen.mesh.formats.ply_header import ORDERS, Table, read_header, read_tables
-from datagen.mesh.formats.surface import Encoded, Image, Material, Surface, numbered, shared_normals
+from datagen.mesh.formats.surface import Encoded, Format, Image, Material, Surface, numbered, one_mesh, shared_normals
 
 _COLOURS = ("red", "green", "blue", "alpha")
 _NORMALS = ("nx", "ny", "nz")
@@ -146,7 +146,7 @@ def _known(corners: NDArray[np.int64], count: int) -> bool:
     return not corners.size or bool(corners.min() >= 0 and corners.max() < count)
 
 
-def built(surface: Surface, vertices: NDArray[np.float64]) -> Encoded:
+def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
     """A binary PLY file: polygons, colours, texture coordinates of corners, and smooth normals where there are any."""
     columns: list[tuple[str, str, NDArray[Any]]] = [(axis, "f4", vertices[:, n]) for n, axis in enumerate("xyz")]
     left_out = []
@@ -159,8 +159,8 @@ def built(surface: Surface, vertices: NDArray[np.float64]) -> Encoded:
     if surface.colours is not None:
         columns += [(name, "u1", surface.colours[:, n]) for n, name in enumerate(_COLOURS)]
     table = np.empty(len(vertices), np.dtype([(name, "<" + kind) for name, kind, _ in columns]))
-    for name, _, column in columns:
-        table[name] = column
+    for field, _, column in columns:
+        table[field] = column
     left_out += ["materials"] if surface.materials else []
     return Encoded(_header_of(columns, surface, len(vertices)) + table.tobytes() + _face_bytes(surface), {}, left_out)
 
@@ -198,3 +198,6 @@ def _face_bytes(surface: Surface) -> bytes:
             out[at[polygon] + 1 + columns * within + column] = part[:, column]
         at = at + 1 + columns * surface.sizes
     return out.tobytes()
+
+
+FORMATS = {".ply": Format(one_mesh(PlyContent), _built)}

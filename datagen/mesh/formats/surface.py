@@ -4,13 +4,19 @@ A reader makes a :class:`Surface`, and a file of another format is made from it.
 not used for writing: there the file itself is written again with other positions.
 """
 
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from datagen.common.errors import MeshError
+from datagen.common.files import read_bounded
+from datagen.mesh.limits import BYTE_LIMIT
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,31 @@ class Content(Protocol):
         """Files that this one names, to be copied along (``content`` is empty)."""
 
 
+@dataclass(frozen=True)
+class Format:
+    """How the files of a format are read and built.
+
+    ``read``: path, and the name of one of several geometries or None -> :class:`Content`. ``build``: surface, vertices
+    [n, 3], the object's name, and the file's stem, None where no files may lie beside it -> :class:`Encoded`.
+    """
+
+    read: Callable[[Path, str | None], Content]
+    build: Callable[[Surface, NDArray[np.float64], str, str | None], Encoded]
+
+
+def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, str | None], Content]:
+    """Return ``read`` of a format whose files are one mesh as a whole."""
+
+    def read(path: Path, geometry: str | None) -> Content:
+        if geometry is not None:
+            raise MeshError(
+                f"{path} is one mesh as a whole; only a GLB has geometries to choose: save {geometry!r} by itself"
+            )
+        return content(read_bounded(path, limit=BYTE_LIMIT), path)
+
+    return read
+
+
 def shared_normals(vertices: NDArray[np.float64], surface: Surface, shading: NDArray[np.int64]) -> NDArray[np.float64]:
     """Unit normals [group, 3] of groups of corners: the mean of their polygons' normals, weighted by area.
 
@@ -142,40 +173,30 @@ def numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
     return rank[number.ravel()]
 
 
-def component_count(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> int:
-    """Pieces that triangles [face, 3] hang together in.
-
-    Vertices [n, 3] at exactly one place count as one, or a seam of a texture would tear a mesh apart; vertices that no
-    face uses do not count.
-    """
-    places = numbered(vertices)[faces]
-    label = np.arange(places.max() + 1)
-    while True:  # each place takes the least number around it; numbers are followed to their end, so rounds are few
-        least = label[places].min(axis=1)
-        before = label.copy()
-        for corner in range(3):
-            np.minimum.at(label, label[places[:, corner]], least)
-            np.minimum.at(label, places[:, corner], least)
-        while not np.array_equal(label, label[label]):
-            label = label[label]
-        if np.array_equal(before, label):
-            return len(np.unique(label[places]))
-
-
 def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
     """The numbers [word] that words of a text stand for; ValueError where one stands for none.
 
     An array of the words themselves would be as wide as the longest of them.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns where it stops at what is no number
-        try:
-            found = np.fromstring(b" ".join(words), np.float64, sep=" ")
-        except DeprecationWarning as error:
-            raise ValueError(str(error)) from error
+    found = numbers_in(b" ".join(words))
     if len(found) != len(words):
         raise ValueError(f"{len(words):,} words are {len(found):,} numbers")
     return found
+
+
+def numbers_in(text: bytes, kind: type[np.generic] = np.float64) -> NDArray[Any]:
+    """The numbers of a text, which white space parts; ValueError where anything else is in it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # NumPy only warns where it stops at what is no number
+        try:
+            return np.fromstring(text, kind, sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(str(error)) from error
+
+
+def one_word(name: str) -> str:
+    """A name as OBJ and MTL files can hold it: without spaces, and not empty."""
+    return re.sub(r"\s+", "_", name.strip()) or "mesh"
 
 
 def linear(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:

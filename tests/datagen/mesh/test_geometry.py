@@ -48,7 +48,7 @@ def test_files_keep_vertices_and_their_order(tmp_path: Path, suffix: str) -> Non
     "content, message",
     [
         ("", r"is empty \(0 bytes\)"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
         ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite, the first is number 1"),
         ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
     ],
@@ -68,7 +68,7 @@ def test_missing_unknown_and_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"unknown mesh format '\.fbx'"):
         load_mesh(tmp_path / "a.fbx")
     (tmp_path / "a.glb").write_bytes(b"not a glb at all")
-    with pytest.raises(MeshError, match="cannot be read as a GLB"):
+    with pytest.raises(MeshError, match="cannot be read as GLB"):
         load_mesh(tmp_path / "a.glb")
 
 
@@ -77,7 +77,7 @@ def test_a_glb_that_says_another_type_is_one_error(tmp_path: Path) -> None:
     content = (tmp_path / "a.glb").read_bytes()
     start, end = content.index(b'[{"attributes"'), content.index(b"}]", content.index(b'[{"attributes"')) + 2
     (tmp_path / "a.glb").write_bytes(content[:start] + b'["x"]'.ljust(end - start) + content[end:])
-    with pytest.raises(MeshError, match="cannot be read as a GLB"):
+    with pytest.raises(MeshError, match="cannot be read as GLB"):
         load_mesh(tmp_path / "a.glb")
 
 

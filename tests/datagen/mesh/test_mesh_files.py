@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from datagen.common.errors import MeshError, StorageError
 from datagen.mesh import limits as mesh_limits
-from datagen.mesh.files import MeshFile, check_writable, posed_bytes, read_mesh_file, save_mesh, write_posed
+from datagen.mesh.files import MeshFile, check_writable, read_mesh_file, save_mesh, write_posed
 from datagen.mesh.formats import FORMATS
 from datagen.mesh.geometry import Mesh
 from tests.datagen.mesh.test_obj import PNG, cube
@@ -43,7 +43,6 @@ def test_every_format_becomes_every_other_with_its_vertices_in_order(tmp_path: P
         assert np.array_equal(again.mesh.faces, read.mesh.faces) and np.allclose(again.mesh.vertices, moved, atol=1e-6)
     loaded = trimesh.load(tmp_path / f"out{other}", process=False, force="mesh")
     assert np.allclose(loaded.triangles, moved[read.mesh.faces], atol=1e-6)
-    assert posed_bytes(read, moved, other)[:40] == (tmp_path / f"out{other}").read_bytes()[:40]
 
 
 @settings(max_examples=20, deadline=None)
@@ -66,7 +65,7 @@ def test_obj_to_glb_keeps_uvs_materials_texture_colours_and_says_what_changes(tm
     assert "quads: written as triangles" in notes and "groups" in notes and "smoothing groups" in notes
     assert any(note.startswith("seams: 16 vertices") for note in notes)  # three sides meet in each of eight corners
     again = read_mesh_file(tmp_path / "cube.glb")
-    assert again.name == "person" and again.components == 1
+    assert again.name == "person"
     assert np.array_equal(again.mesh.vertices[:8], read.mesh.vertices)
     before, after = read.content.surface, again.content.surface
     assert [material.name for material in after.materials] == ["skin", "cloth"]
@@ -179,15 +178,6 @@ def test_a_hole_of_three_gigabytes_is_refused_at_once(tmp_path: Path) -> None:
         file.truncate(3 * 2**30)
     with pytest.raises(MeshError, match="bytes, more than"):
         read_mesh_file(tmp_path / "huge.glb")
-
-
-def test_components_count_pieces_but_not_seams_nor_stray_vertices(tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(2)
-    seam = Mesh(ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3))
-    assert saved(tmp_path, ".ply", seam).components == 1
-    vertices = np.concatenate([ball.vertices, ball.vertices + 5, [[9, 9, 9]]])
-    two = Mesh(vertices, np.concatenate([ball.faces, ball.faces + len(ball.vertices)]))
-    assert saved(tmp_path, ".off", two).components == 2
 
 
 def test_vertices_that_are_not_the_originals_are_not_written(tmp_path: Path) -> None:

@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
+from datagen.mesh.formats.obj import ObjContent, face_lines, vertex_lines
 
 CUBE = b"""# made by hand, caf\xe9
 mtllib look.mtl
@@ -61,7 +64,7 @@ def lines_of(content: bytes, *starts: bytes) -> list[bytes]:
 
 def test_vertices_faces_name_and_fans_of_quads(tmp_path: Path) -> None:
     read = read_mesh_file(cube(tmp_path))
-    assert read.name == "person" and read.components == 1 and read.mesh.vertices.shape == (8, 3)
+    assert read.name == "person" and read.mesh.vertices.shape == (8, 3)
     assert read.mesh.faces[:2].tolist() == [[3, 2, 1], [3, 1, 0]] and len(read.mesh.faces) == 12
     assert read.mesh.faces[6].tolist() == [1, 2, 6]
 
@@ -178,3 +181,45 @@ def test_broken_files_say_in_one_line_what_is_wrong(tmp_path: Path, text: bytes,
     with pytest.raises(MeshError, match=message) as caught:
         read_mesh_file(tmp_path / "bad.obj")
     assert "\n" not in str(caught.value) and str(tmp_path / "bad.obj") in str(caught.value)
+
+
+@settings(max_examples=50)
+@given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=3, max_size=30))
+def test_every_float32_comes_back_bit_for_bit(numbers: list[float]) -> None:
+    vertices = np.array(numbers[: len(numbers) // 3 * 3], np.float32).reshape(-1, 3)
+    faces = np.array([[0, 0, 0]])
+    read = ObjContent((vertex_lines(vertices) + face_lines(faces)).encode(), Path("a.obj"))
+    assert read.vertices.astype(np.float32).tobytes() == vertices.tobytes()
+    assert np.array_equal(read.surface.faces, faces)
+
+
+def test_faces_count_from_one_in_the_file() -> None:
+    assert face_lines(np.array([[0, 1, 2], [2, 1, 3]], np.int32)) == "f 1 2 3\nf 3 2 4\n"
+
+
+PLAIN = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# made by hand\r\nmtllib a.mtl\r\no it\r\ng all\r\nvn 0 0 1\r\n" + PLAIN,
+        PLAIN.replace("f 1 2 3", "f 1/1 2/1 3/1\nvt 0 0"),
+        PLAIN.replace("f 1 2 3", "f -3 -2 -1"),
+        PLAIN.replace("f 1 2 3", "f 1 2 3 # all"),
+        PLAIN.replace("f 1 2 3", "f 1 \\\n2 3"),
+        PLAIN.replace("v 1 0 0", "v 1 0 0 0.5 0.5 0.5"),
+        PLAIN.replace("v 1 0 0", "v\t1 0 0"),
+        PLAIN.replace("v 1 0 0", "  v 1 0 0 # here"),
+        PLAIN.replace("f 1 2 3", "f 1 2\nf 1 2 3"),
+    ],
+)
+def test_a_triangle_in_other_words_is_the_same_triangle(text: str) -> None:
+    read = ObjContent(text.encode(), Path("a.obj"))
+    assert read.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]] and read.surface.faces.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.parametrize("rows", ["v 0 0\nv 1 0 0 0\n", "v 0 0\nv 1 0 0 nan\n"])
+def test_lines_of_other_lengths_are_not_taken_for_regular_ones(rows: str) -> None:
+    with pytest.raises(ValueError, match="line 1 is not 3 numbers: 'v 0 0'"):
+        ObjContent((rows + PLAIN).encode(), Path("a.obj"))
