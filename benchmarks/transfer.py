@@ -26,8 +26,7 @@ from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh
 from training.checkpoints.checkpoint import save_checkpoint
 from training.inference.predict import network_from
-from training.inference.refinement import DEFAULT_WEIGHT
-from training.inference.transfer import PoseTransfer
+from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from training.recipes.training import TrainingRecipe
 
 
@@ -72,7 +71,7 @@ def inside(transfer: PoseTransfer, source: Mesh, target: Mesh) -> dict[str, floa
     probe = np.repeat(source.vertices[None, :256], 24, axis=0)
     return {
         "one pair": median(lambda: transfer(source=source, target=target)),
-        "one pair, refined": median(lambda: transfer(source=source, target=target, refine=DEFAULT_WEIGHT)),
+        "one pair, refined": median(lambda: transfer(source=source, target=target, refine=REFINE_WEIGHT)),
         "how one mesh stands (24 ways)": median(lambda: transfer.self_errors(probe)),
     }
 

@@ -13,9 +13,8 @@ import torch
 
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from training.inference.placement import scale_of
 from training.inference.refinement import Refinement
-from training.inference.transfer import PoseTransfer
+from training.inference.transfer import PoseTransfer, scale_of
 from training.objectives import metrics
 
 WEIGHTS = (0.0, 0.5, 2.0, 6.0, 20.0, 60.0)

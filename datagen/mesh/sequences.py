@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from datagen.common.errors import MeshError
 from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
 from datagen.mesh.formats import FORMATS
-from datagen.mesh.formats.glb_writer import FRAME_LIMIT, LARGEST
 
 INTERPOLATIONS = ("LINEAR", "STEP")
 
@@ -82,6 +81,8 @@ def require_animation(original: MeshFile, frames: int) -> None:
     MeshError
         They are more than ``FRAME_LIMIT``, or than 4 GiB.
     """
+    from datagen.mesh.formats.glb_writer import FRAME_LIMIT, LARGEST
+
     if frames > FRAME_LIMIT:
         raise MeshError(f"{frames:,} frames are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere")
     size = frames * draft_of(original).frame_bytes

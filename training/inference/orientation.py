@@ -169,11 +169,6 @@ def orientation(self_errors: SelfErrors, meshes: Sequence[Floats]) -> Orientatio
     return Orientation(errors, turned)
 
 
-def self_error(self_errors: SelfErrors, mesh: Floats) -> float:
-    """PMD of one mesh [n, 3], Y up and facing +Z, transferred onto itself."""
-    return float(self_errors(_probe(mesh)[None])[0])
-
-
 def _turned_ways(mesh: Floats) -> Floats:
     return np.stack([axes.turned(_probe(mesh)) for axes in EVERY_AXES])
 

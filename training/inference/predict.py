@@ -1,7 +1,7 @@
 """Networks from recipes and checkpoints, and running them over meshes."""
 
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -9,11 +9,12 @@ from torch import Tensor, nn
 from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.weights import fill_network
-from training.data.batch import Batch
 from training.networks import network_from
 from training.networks.execution import GraphedTransfer
-from training.networks.padded_batches import MixedCounts
 from training.recipes.training import TrainingRecipe
+
+if TYPE_CHECKING:
+    from training.data.batch import Batch
 
 _MESHES_AT_ONCE = 8
 
@@ -47,7 +48,7 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
 
 
 @torch.no_grad()
-def predict(network: nn.Module, batch: Batch) -> Tensor:
+def predict(network: nn.Module, batch: "Batch") -> Tensor:
     """Output vertices [batch, vertex, 3] in float32 precision, a few meshes at a time so that memory stays bounded.
 
     Rows behind a mesh's count are zero. On a GPU a single pair whose shapes have come before is replayed (see
@@ -55,11 +56,14 @@ def predict(network: nn.Module, batch: Batch) -> Tensor:
     """
     parts = [batch.part(start, start + _MESHES_AT_ONCE) for start in range(0, len(batch), _MESHES_AT_ONCE)]
     if batch.source_counts or batch.target_counts:
-        return torch.cat([_predict_mixed(MixedCounts(network), part) for part in parts])
+        return torch.cat([_predict_mixed(network, part) for part in parts])
     transfer = GraphedTransfer(network)
     return torch.cat([transfer(source=part.source, target=part.target) for part in parts])
 
 
-def _predict_mixed(network: MixedCounts, batch: Batch) -> Tensor:
+def _predict_mixed(network: nn.Module, batch: "Batch") -> Tensor:
+    from training.networks.padded_batches import MixedCounts
+
     counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
-    return cast(Tensor, network(source=batch.source, target=batch.target, **counts))
+    found: Tensor = MixedCounts(network)(source=batch.source, target=batch.target, **counts)
+    return found

@@ -15,8 +15,6 @@ from scipy.sparse.linalg import splu
 from datagen.mesh.geometry import Mesh, edges_of
 
 Floats = NDArray[np.floating]
-DEFAULT_WEIGHT = 6.0
-"""The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/transfer.md)."""
 _STEPS = 8
 
 
@@ -27,7 +25,7 @@ class Refinement:
     are one point here, so that no seam opens.
     """
 
-    def __init__(self, target: Mesh, *, weight: float = DEFAULT_WEIGHT, steps: int = _STEPS) -> None:
+    def __init__(self, target: Mesh, *, weight: float, steps: int = _STEPS) -> None:
         """``target``: vertices [n, 3] and faces; ``weight``: of the edges, 0 leaves the output as it is.
 
         It is w for a thousand points: w grows with their number, for edges shorten as points grow more, and the same

@@ -1,6 +1,15 @@
-"""Pose transfer for a person's own meshes: a mesh in the wanted pose and a mesh of the wanted identity in, one out."""
+"""Pose transfer for a person's own meshes: a mesh in the wanted pose and a mesh of the wanted identity in, one out.
+
+Networks answer in a normalised box, people ask for the target's size and place.
+
+Size: a pose changes the box, so the scale comes from edge lengths, which a pose hardly changes: their median ratio to
+the target's. Place: the lowest vertex stays at the target's height and the middle of the box stays above the same spot
+of the ground, so that a body that sits down sits on the ground on which it stood. Centring the box instead, as the
+paper's normalisation suggests, would let it float at the height of its hips.
+"""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +19,15 @@ from torch import nn
 
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
 from training.inference.orientation import UPRIGHT, Axes
-from training.inference.placement import Path as SourcePath
-from training.inference.placement import placed, scale_of
 from training.inference.predict import load_trained
-from training.inference.refinement import Refinement
-from training.inference.smoothing import smoothed
 from training.networks.execution import GraphedTransfer, Precision
 from training.objectives.metrics import point_mesh_distance
 
 Floats = NDArray[np.floating]
 _VERTICES_AT_ONCE = 8192  # of self-transfers, so that memory stays bounded
+REFINE_WEIGHT = 6.0
+"""The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/transfer.md)."""
+_NO_LENGTH = 1e-9  # of the normalised box: an edge that has none says nothing of the scale
 
 
 class PoseTransfer:
@@ -71,8 +79,7 @@ class PoseTransfer:
         -------
         Mesh
             The target's faces, and its vertices moved, in the target's order, axes and unit: edges keep the length that
-            they have in the target (median over edges), and it stands where the target stands
-        (training.inference.placement).
+            they have in the target (median over edges), and it stands where the target stands.
 
         Raises
         ------
@@ -96,7 +103,7 @@ class PoseTransfer:
 
         Every source is normalised by its own box, as each was in training: with one box for all, a body that crouches
         or has walked away would be a small one in a corner, such as no network has seen. What the boxes take away, the
-        way through space, is given back (:class:`training.inference.placement.Path`).
+        way through space, is given back (:class:`RootTrajectory`).
 
         Parameters
         ----------
@@ -116,8 +123,16 @@ class PoseTransfer:
         """
         check_mesh(target, name="target")
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
-        frames: Iterator[Floats] = smoothed(self._frames(sources, upright, source_axes), smooth)
-        refinement = Refinement(upright, weight=refine) if refine else None
+        frames = self._frames(sources, upright, source_axes)
+        if smooth:
+            from training.inference.smoothing import smoothed
+
+            frames = smoothed(frames, smooth)
+        refinement = None
+        if refine:
+            from training.inference.refinement import Refinement
+
+            refinement = Refinement(upright, weight=refine)
         for vertices in frames:
             finished = refinement(vertices) if refinement else vertices
             yield Mesh(target_axes.restored(finished), target.faces)
@@ -146,9 +161,54 @@ class PoseTransfer:
 
     def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Axes) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up."""
-        path: SourcePath | None = None
+        trajectory: RootTrajectory | None = None
         for number, source in enumerate(sources):
             vertices = axes.turned(check_mesh(source, name=f"source {number}").vertices)
             output = self.vertices(vertices, target.vertices)
-            path = path or SourcePath.from_first(vertices, scale_of(target, output))
-            yield placed(target, output) + path.offset(vertices)
+            trajectory = trajectory or RootTrajectory.from_first(vertices, scale_of(target, output))
+            yield placed(target, output) + trajectory.offset(vertices)
+
+
+@dataclass(frozen=True)
+class RootTrajectory:
+    """The way that the frames of a sequence go over and above the ground, in the units of the target.
+
+    A frame's box holds no place, so a walk would be a walk on the spot. The output goes where the source goes, with
+    steps as long as its own size asks for. The ratio is that of the first frame, lest it tremble.
+    """
+
+    start: Floats
+    ratio: float
+
+    @classmethod
+    def from_first(cls, source: Floats, output_scale: float) -> "RootTrajectory":
+        """A trajectory that begins where the target stands; ``source`` [n, 3] is the first frame, Y up."""
+        return cls(standing_point(source), output_scale / float(bounding_box(source).half))
+
+    def offset(self, source: Floats) -> Floats:
+        """How far [3] the output of this frame is from where the first one stands."""
+        return (standing_point(source) - self.start) * self.ratio
+
+
+def scale_of(target: Mesh, vertices: Floats) -> float:
+    """How many units of the target one unit of the output's box is; vertices [n, 3] in the normalised box."""
+    before, after = (_side_lengths(each, target.faces) for each in (target.vertices, vertices))
+    usable = (after > _NO_LENGTH) & (before > 0)
+    return float(np.median(before[usable] / after[usable])) if usable.any() else 1.0
+
+
+def standing_point(vertices: Floats) -> NDArray[np.float64]:
+    """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+
+
+def placed(target: Mesh, vertices: Floats) -> Floats:
+    """Vertices [n, 3] in the normalised box -> the target's size and place; all with Y up."""
+    sized = vertices * scale_of(target, vertices)
+    return sized - standing_point(sized) + standing_point(target.vertices)
+
+
+def _side_lengths(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    corners = vertices[faces]
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).ravel()

@@ -3,10 +3,13 @@
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from datagen.common.files import resolve_within
-from datagen.store import Dataset
 from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
+
+if TYPE_CHECKING:
+    from datagen.store import Dataset
 
 _WEIGHTS = ".safetensors"
 _WORDS: dict[str, Which] = {"result": "result", "latest": "latest", "best": "best"}
@@ -29,7 +32,7 @@ class Evaluated:
         """The one checkpoint's folder or file, which stays the same while training goes on."""
         return self.checkpoint.path
 
-    def folder(self, dataset: Dataset) -> Path:
+    def folder(self, dataset: "Dataset") -> Path:
         """HOME/evaluation[-DATASET][-LABEL]; DATASET where it is another than the weights were trained on."""
         own = self.checkpoint.dataset == dataset.uuid
         other = "" if own else Path(dataset.url).stem

@@ -21,9 +21,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
-from training.inference.refinement import DEFAULT_WEIGHT
-from training.inference.transfer import PoseTransfer
-from workflows.pipeline.progress import bar
+from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
@@ -122,12 +120,15 @@ class TransferWork:
             map(self._source, range(count)),
             self.target.mesh,
             smooth=self.job.window,
-            refine=DEFAULT_WEIGHT if self.job.refine else 0.0,
+            refine=REFINE_WEIGHT if self.job.refine else 0.0,
             source_axes=self.axes[0],
             target_axes=self.axes[1],
         )
-        passing = bar(frames, total=count, what="transfer", unit="frame") if self.job.is_sequence else frames
-        for number, posed in enumerate(passing):
+        if self.job.is_sequence:
+            from workflows.pipeline.progress import bar
+
+            frames = bar(frames, total=count, what="transfer", unit="frame")
+        for number, posed in enumerate(frames):
             if number in kept:
                 self._shown[number] = posed
             yield posed

@@ -88,7 +88,7 @@ class ObjContent:
         """The faces, with materials from the libraries beside the file."""
         table, sizes = self._face_corners
         names = self._names(b"usemtl")
-        known = {material.name: material for material in self._libraries.materials}
+        known = {material.name: material for material in self._libraries.materials} if names else {}
         used = list(dict.fromkeys(name for name in names if name in known))
         current = np.searchsorted(np.array(self._at[b"usemtl"], np.int64), np.array(self._at[b"f"], np.int64)) - 1
         number_of = np.array([used.index(name) if name in used else -1 for name in names] + [-1], np.int64)

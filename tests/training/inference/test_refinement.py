@@ -37,7 +37,7 @@ def test_a_turned_and_moved_target_stays_as_it_is() -> None:
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     moved = mesh.vertices @ turn.T + (3, -1, 2)
-    assert np.allclose(Refinement(mesh)(moved), moved, atol=1e-9)
+    assert np.allclose(Refinement(mesh, weight=6.0)(moved), moved, atol=1e-9)
 
 
 def test_a_noisy_pose_comes_nearer_to_the_clean_one_and_to_the_lengths_of_the_target() -> None:
@@ -62,16 +62,16 @@ def test_vertices_at_one_place_of_the_target_stay_together() -> None:
     faces[: len(faces) // 2] = np.where(faces[: len(faces) // 2] == 57, len(mesh.vertices), faces[: len(faces) // 2])
     split = Mesh(np.concatenate([mesh.vertices, mesh.vertices[57:58]]), faces)
     noisy = bent(mesh.vertices) + np.random.default_rng(3).normal(0, 0.03, mesh.vertices.shape)
-    found = Refinement(split)(np.concatenate([noisy, noisy[57:58]]))
+    found = Refinement(split, weight=6.0)(np.concatenate([noisy, noisy[57:58]]))
     assert np.array_equal(found[57], found[-1])
-    assert np.allclose(found[:-1], Refinement(mesh)(noisy), atol=1e-9)
+    assert np.allclose(found[:-1], Refinement(mesh, weight=6.0)(noisy), atol=1e-9)
 
 
 def test_an_unused_vertex_and_an_edge_without_length_do_no_harm() -> None:
     mesh = tube()
     faces = np.concatenate([mesh.faces, [[0, len(mesh.vertices), 0]]])
     doubled = Mesh(np.concatenate([mesh.vertices, mesh.vertices[:1], [[9.0, 9, 9]]]), faces)
-    found = Refinement(doubled)(doubled.vertices * 1.0)
+    found = Refinement(doubled, weight=6.0)(doubled.vertices * 1.0)
     assert np.allclose(found, doubled.vertices, atol=1e-9)
 
 

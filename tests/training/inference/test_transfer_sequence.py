@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh, bounding_box
 from training.inference.orientation import Axes
-from training.inference.placement import standing_point
 from training.inference.smoothing import smoothed
-from training.inference.transfer import PoseTransfer
+from training.inference.transfer import PoseTransfer, standing_point
 from training.networks import build_network
 
 FACES = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
