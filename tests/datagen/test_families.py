@@ -13,8 +13,8 @@ from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.schema import open_group
 from datagen.store.verify import describe, find_faults, require_recipe
-from tests.support.bodies import FAMILIES, recipe_parts
 from tests.support.files import flip_bit, tree_hash
+from tests.support.shapes.bodies import FAMILIES, recipe_parts
 
 
 def small(parts: dict[str, Any]) -> DatasetRecipe:

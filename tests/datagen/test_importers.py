@@ -12,7 +12,7 @@ from datagen.common.errors import BodyError, RecipeError
 from datagen.generate import generate
 from datagen.importers import found_recipe, listed_triples, read_test_list, require_files
 from datagen.recipe import DatasetRecipe, ImportedBody
-from tests.support.meshes import faust_folder, garment_folder, npt_folder, tetrahedron
+from tests.support.shapes.meshes import faust_folder, garment_folder, npt_folder, tetrahedron
 
 
 def changed(recipe: DatasetRecipe, **sections: dict[str, Any]) -> DatasetRecipe:

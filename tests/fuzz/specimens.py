@@ -15,9 +15,9 @@ from datagen.poses import PARENTS, Poses
 from datagen.poses.pose_files import write_pose_file
 from datagen.poses.skeletons import JOINTS
 from datagen.store import open_dataset
-from tests.support.models import random_model, save_npz, save_pickle
 from tests.support.recipes import tiny_dataset, tiny_training
-from tests.support.rigged_files import Rig, about
+from tests.support.shapes.models import random_model, save_npz, save_pickle
+from tests.support.shapes.rigged_files import Rig, about
 
 OBJ = """# made by hand
 mtllib look.mtl

@@ -36,3 +36,14 @@ def tiny_training(**changes: Any) -> TrainingRecipe:
         "keep_checkpoints": 3,
     }
     return TrainingRecipe.model_validate(values | changes)
+
+
+MIXED_COUNTS = (32, 30, 30)
+"""Vertices of identities 0, 1, 2, then again; the last two have equal counts and different faces."""
+
+
+def mixed_dataset() -> DatasetRecipe:
+    """Five training and three evaluation legs of three kinds."""
+    kinds = [(8, 4), (6, 5), (10, 3)]
+    bodies = [{"family": "leg", "rings": rings, "segments": segments} for rings, segments in kinds]
+    return tiny_dataset(body={"family": "mixed", "bodies": bodies}, identities={"training": 5, "evaluation": 3})

@@ -11,7 +11,7 @@ from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
 from datagen.poses import JOINTS, Poses, draw_poses, load_poses
 from datagen.recipe import AnnyBody, DatasetRecipe, LegBody, MixedBody, PoseRecipe, RangePoses
-from tests.support.bodies import COARSE, FAMILIES, PEOPLE, recipe_parts
+from tests.support.shapes.bodies import COARSE, FAMILIES, PEOPLE, recipe_parts
 
 
 class Family(NamedTuple):

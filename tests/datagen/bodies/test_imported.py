@@ -19,7 +19,7 @@ from datagen.poses import Poses, draw_poses, load_poses
 from datagen.recipe import ImportedBody, LegBody, PoseRecipe
 from datagen.store.verify import find_faults
 from tests.support.files import flip_bit, tree_hash
-from tests.support.meshes import FACES, faust_folder, garment_folder, npt_folder, save, tetrahedron
+from tests.support.shapes.meshes import FACES, faust_folder, garment_folder, npt_folder, save, tetrahedron
 
 FOUND = PoseRecipe.model_validate({"seen": 3, "unseen": 0, "distribution": {"name": "found"}})
 

@@ -14,7 +14,7 @@ from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
 from datagen.poses import PARENTS, draw_poses
 from datagen.recipe import PoseRecipe, SmplBody
-from tests.support.models import Arrays, arrays_of, random_model, save_npz, save_pickle, tree
+from tests.support.shapes.models import Arrays, arrays_of, random_model, save_npz, save_pickle, tree
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])

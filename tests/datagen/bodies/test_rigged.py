@@ -17,8 +17,8 @@ from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, check_mesh, edges_of
 from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe, RiggedBody
-from tests.support.real_animals import require_animals
-from tests.support.rigged_files import BOXES, JOINTS, Floats, Rig
+from tests.support.shapes.real_animals import require_animals
+from tests.support.shapes.rigged_files import BOXES, JOINTS, Floats, Rig
 
 REST = Poses(("Hips",), (-1,), np.zeros((1, 1, 3)))
 

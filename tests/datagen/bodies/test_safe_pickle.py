@@ -22,8 +22,8 @@ from datagen.bodies.smpl_family.model_file import read_arrays
 from datagen.bodies.smpl_family.safe_pickle import Recorded, unpickle
 from datagen.bodies.smpl_family.safe_pickle_arrays import array_of
 from datagen.common.errors import BodyError
-from tests.support.archives import DAMAGES
-from tests.support.models import fake_chumpy
+from tests.support.damage.archives import DAMAGES
+from tests.support.shapes.models import fake_chumpy
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 

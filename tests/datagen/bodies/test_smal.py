@@ -16,7 +16,7 @@ from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import PoseRecipe, RangePoses, SmalBody
-from tests.support.models import Arrays, random_model, reference, save_npz, save_pickle
+from tests.support.shapes.models import Arrays, random_model, reference, save_npz, save_pickle
 
 RANGES = PoseRecipe(distribution=RangePoses(skeleton="smal", uniform=20))
 

@@ -22,7 +22,7 @@ from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, MixedBody, PoseRecipe, RangePoses, SmplBody
-from tests.support.models import arrays_of, random_model, reference, save_npz, tree
+from tests.support.shapes.models import arrays_of, random_model, reference, save_npz, tree
 
 MODELS = ("smpl", "smplh", "smplx")
 TOLERANCE = 2e-6  # metres

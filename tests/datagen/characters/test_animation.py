@@ -13,7 +13,7 @@ from datagen.characters.animation import Track, read_clips, world_frames
 from datagen.characters.character import load_character
 from datagen.common.errors import BodyError
 from datagen.mesh.formats.gltf import Gltf, triangles
-from tests.support.rigged_files import Document, Rig, about
+from tests.support.shapes.rigged_files import Document, Rig, about
 
 NUMBERS = np.arange(12, dtype=np.float32).reshape(4, 3)
 

@@ -13,7 +13,7 @@ from datagen.characters.cc0_animals import SHA256
 from datagen.characters.character import Character, load_character, load_characters, shared_joints
 from datagen.characters.joint_names import pairs, parts, side
 from datagen.common.errors import BodyError, RecipeError
-from tests.support.rigged_files import BOXES, JOINTS, Floats, Rig, about
+from tests.support.shapes.rigged_files import BOXES, JOINTS, Floats, Rig, about
 
 Z_UP = about("x", 90)
 

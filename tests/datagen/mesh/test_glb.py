@@ -12,7 +12,7 @@ import trimesh
 from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
 from datagen.mesh.formats.gltf import Gltf
-from tests.support.rigged_files import Document
+from tests.support.shapes.rigged_files import Document
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -11,7 +11,7 @@ from datagen.common.errors import RecipeError
 from datagen.poses import JOINTS, draw_poses, load_poses
 from datagen.poses.amass import smpl_pose
 from datagen.recipe import PoseRecipe
-from tests.support.archives import DAMAGES
+from tests.support.damage.archives import DAMAGES
 
 STANDING = np.array([np.pi / 2, 0, 0])  # AMASS: Z up, so who stands is SMPL's rest pose turned a quarter about x
 

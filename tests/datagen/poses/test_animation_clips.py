@@ -14,8 +14,8 @@ from datagen.mesh.geometry import edges_of
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.animation_clips import ClipSource, shared_skeleton
 from datagen.recipe import ClipPoses, PoseRecipe, RangePoses, RiggedBody
-from tests.support.real_animals import require_animals
-from tests.support.rigged_files import BOXES, JOINTS, Floats, Rig, about
+from tests.support.shapes.real_animals import require_animals
+from tests.support.shapes.rigged_files import BOXES, JOINTS, Floats, Rig, about
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from datagen.poses import JOINTS, PARENTS, Poses, draw_poses, load_poses
 from datagen.poses.pose_files import read_pose_file, write_pose_file
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import PoseRecipe
-from tests.support.archives import DAMAGES
+from tests.support.damage.archives import DAMAGES
 
 
 def recipe_of(path: Path, *, seen: int = 4, unseen: int = 2) -> PoseRecipe:

@@ -22,8 +22,8 @@ from datagen.store import open_dataset
 from datagen.store.object_names import is_member
 from datagen.store.objects import LocalObjects
 from datagen.store.verify import describe, find_faults, require_recipe
+from tests.support.damage.datasets import edit, sealed
 from tests.support.files import tree_hash
-from tests.support.hostile import edit, sealed
 from tests.support.recipes import tiny_dataset
 from workflows.cli.main import main
 

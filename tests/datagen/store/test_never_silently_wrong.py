@@ -19,8 +19,8 @@ from datagen.store.schema import open_group, shard_path
 from datagen.store.verify import find_faults
 from datagen.store.writer import write_shard
 from tests.support.files import tree_hash
-from tests.support.meshes import npt_folder
 from tests.support.recipes import tiny_dataset
+from tests.support.shapes.meshes import npt_folder
 
 OTHER = tiny_dataset(identities={"training": 3, "evaluation": 2, "seed": 5})
 

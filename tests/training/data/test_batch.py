@@ -10,8 +10,7 @@ from datagen.common.errors import DatasetError
 from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from tests.support.mixed import MIXED_COUNTS, mixed_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import MIXED_COUNTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation, Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
 from training.data.triples import TripleOrder

@@ -13,8 +13,7 @@ from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import mixed_dataset, tiny_dataset
 from training.data.triples import TripleOrder, epoch_triples
 from training.data.vertex_bank import open_bank
 

@@ -15,8 +15,7 @@ from datagen.common.errors import DatasetError, RecipeError
 from datagen.generate import generate
 from datagen.store import Dataset, open_dataset
 from tests.support.files import flip_bit, truncate
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import mixed_dataset, tiny_dataset
 from tests.training.data.test_batch import same
 from training.data.batch import Batch
 from training.data.cache_policy import Room, choose, room_of

@@ -12,8 +12,7 @@ from datagen.common.errors import CheckpointError, EvaluationError, MeshError
 from datagen.generate import generate, inline
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.recipes import mixed_dataset, tiny_dataset, tiny_training
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.data.batch import read_batch
 from training.engine.trainer import train

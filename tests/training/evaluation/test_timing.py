@@ -8,8 +8,7 @@ import torch
 
 from datagen.common.errors import CheckpointError, EvaluationError
 from datagen.store import open_dataset
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import mixed_dataset, tiny_training
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.data.batch import read_batch
 from training.engine.trainer import train

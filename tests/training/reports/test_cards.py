@@ -12,8 +12,7 @@ import yaml
 from datagen.generate import generate
 from datagen.recipe import AmassPoses, Body, ClipPoses, DatasetRecipe, FilePoses, FoundPoses, NptPoses, RangePoses
 from datagen.store import Dataset, open_dataset
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import mixed_dataset, tiny_training
 from tests.support.workflows import finished_workflow
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.evaluation.evaluate import NO_OPS, Row

@@ -11,8 +11,7 @@ from datagen.generate import generate
 from datagen.mesh.files import load_mesh
 from datagen.mesh.geometry import bounding_box
 from datagen.store import Dataset, open_dataset
-from tests.support.mixed import mixed_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import mixed_dataset, tiny_training
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.inference.predict import network_from
 from training.recipes.training import EvaluationRecipe

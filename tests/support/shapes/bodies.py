@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from datagen.bodies.standins.smpl_format import write_standin
-from tests.support.meshes import npt_folder
-from tests.support.rigged_files import BOXES, JOINTS, Rig, about
+from tests.support.shapes.meshes import npt_folder
+from tests.support.shapes.rigged_files import BOXES, JOINTS, Rig, about
 
 COARSE = "notoes_collapse3pc"
 FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "leg")
