@@ -44,34 +44,6 @@ def test_files_keep_vertices_and_their_order(tmp_path: Path, suffix: str) -> Non
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize(
-    "content, message",
-    [
-        ("", r"is empty \(0 bytes\)"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
-        ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite, the first is number 1"),
-        ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
-    ],
-)
-def test_unusable_files_say_what_and_where(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "bad.obj"
-    path.write_text(content)
-    with pytest.raises(MeshError, match=message) as caught:
-        load_mesh(path)
-    assert str(path) in str(caught.value)
-
-
-def test_missing_unknown_and_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match="no mesh file at"):
-        load_mesh(tmp_path / "none.obj")
-    (tmp_path / "a.fbx").write_text("x")
-    with pytest.raises(MeshError, match=r"unknown mesh format '\.fbx'"):
-        load_mesh(tmp_path / "a.fbx")
-    (tmp_path / "a.glb").write_bytes(b"not a glb at all")
-    with pytest.raises(MeshError, match="cannot be read as GLB"):
-        load_mesh(tmp_path / "a.glb")
-
-
 def test_a_glb_that_says_another_type_is_one_error(tmp_path: Path) -> None:
     save_mesh(TETRAHEDRON, tmp_path / "a.glb")
     content = (tmp_path / "a.glb").read_bytes()
@@ -91,18 +63,6 @@ def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="could not write"):
         save_mesh(TETRAHEDRON, tmp_path / "file" / "mesh.obj")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
-def test_an_obj_with_materials_groups_and_texture_seams_keeps_its_one_list_of_vertices(tmp_path: Path) -> None:
-    """As bodies from artists' tools come: skin and clothes as materials, a vertex with two texture coordinates."""
-    (tmp_path / "person.mtl").write_text("newmtl skin\nnewmtl cloth\n")
-    (tmp_path / "person.obj").write_text(
-        "mtllib person.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
-        "g torso\nusemtl skin\nf 1/1 2/2 3/3\ng legs\nusemtl cloth\nf 1/4 3/3 4/2\nf 2/1 4/4 3/2\n"
-    )
-    mesh = load_mesh(tmp_path / "person.obj")
-    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 3, 2]]
 
 
 @pytest.mark.parametrize("vertices", [1, 127, 128, 300])

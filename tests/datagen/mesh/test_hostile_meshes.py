@@ -29,7 +29,7 @@ from datagen.mesh.formats import mtl as mesh_materials
 from datagen.mesh.formats.gltf import Gltf
 from datagen.poses.amass_files import find_motions
 from datagen.poses.pose_files import read_pose_file
-from tests.datagen.mesh.test_glb import FACES, POINTS, scene
+from tests.support.shapes.mesh_files import FACES, POINTS, scene
 from tests.support.shapes.rigged_files import Document, Rig
 
 SECRET = b"newmtl skin\nKd 1 1 1\n# the key to the house\n"

@@ -18,12 +18,11 @@ from datagen.mesh import limits as mesh_limits
 from datagen.mesh.files import MeshFile, check_writable, read_mesh_file, save_mesh, write_posed
 from datagen.mesh.formats import FORMATS
 from datagen.mesh.geometry import Mesh
-from tests.datagen.mesh.test_obj import PNG, cube
+from tests.support.shapes.mesh_files import PNG, golden
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 )
-POINTS = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
 
 
 def saved(folder: Path, suffix: str, mesh: Mesh = TETRAHEDRON) -> MeshFile:
@@ -60,7 +59,7 @@ def test_any_triangles_come_back_as_they_were(tmp_path_factory: pytest.TempPathF
 
 
 def test_obj_to_glb_keeps_uvs_materials_texture_colours_and_says_what_changes(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.glb")
     assert "quads: written as triangles" in notes and "groups" in notes and "smoothing groups" in notes
     assert any(note.startswith("seams: 16 vertices") for note in notes)  # three sides meet in each of eight corners
@@ -78,7 +77,7 @@ def test_obj_to_glb_keeps_uvs_materials_texture_colours_and_says_what_changes(tm
 
 
 def test_glb_to_obj_and_back_keeps_uvs_materials_and_texture(tmp_path: Path) -> None:
-    original = read_mesh_file(cube(tmp_path))
+    original = read_mesh_file(golden("cube.obj", tmp_path))
     write_posed(original, original.mesh.vertices, tmp_path / "cube.glb")
     read = read_mesh_file(tmp_path / "cube.glb")
     assert write_posed(read, read.mesh.vertices, tmp_path / "new" / "cube.obj") == []
@@ -93,43 +92,12 @@ def test_glb_to_obj_and_back_keeps_uvs_materials_and_texture(tmp_path: Path) -> 
 
 
 def test_what_off_and_stl_cannot_hold_is_named(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.stl")
     assert {"texture coordinates", "materials", "colours", "quads: written as triangles"} <= set(notes)
     notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.off")
     assert {"texture coordinates", "materials"} <= set(notes) and "quads: written as triangles" not in notes
     assert b"\n4 3 2 1 0\n" in (tmp_path / "cube.off").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.obj", b"", "is empty"),
-        ("a.glb", b"v 0 0 0\n", "does not begin with 'glTF'"),
-        ("a.glb", b"glTF\2\0\0\0", "cannot be read|not a sound"),
-        ("a.ply", b"hello", "does not begin with a PLY header"),
-        ("a.ply", (POINTS.format(3) + "end_header\n0 0 0\n1 0 0\n0 1 1\n").encode(), "no faces"),
-        ("a.ply", (POINTS.format(9) + "end_header\n0 0 0\n1 0 0\n0 1 1\n").encode(), "ends before its 9"),
-        ("a.ply", (POINTS.format(100_000_000) + "end_header\n").encode(), "100,000,000 counted.*decimate"),
-        ("a.off", b"OFF\n100000000 5 0\n", "decimate"),
-        ("a.off", b"OFF\n4 1 0\n0 0 0\n1 0 0\n", "ends before"),
-        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 1\n3 0 1 7\n", "names vertex 7"),
-        ("a.off", b"OFF BINARY\n3 1 0\n", "begins with"),
-        ("a.stl", b"neither", "neither"),
-        ("a.stl", b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "no three corners|ends before"),
-        ("a.fbx", b"x", "unknown mesh format"),
-        ("a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", "not finite, the first is number 1"),
-        ("a.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
-        ("a.obj", b"v 0 0 5\nv 1 0 5\nv 0 1 5\nf 1 2 3\n", "flat: it has no thickness along z"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "thickness along y and z"),
-        ("a.obj", b"v 0 0 0\nv 1 0 1\nv 0 1 1\nv 1 1 2\nf 1 2 3\nf 2 4 3\n", "one slanted plane"),
-    ],
-)
-def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(MeshError, match=message) as caught:
-        read_mesh_file(tmp_path / name)
-    assert "\n" not in str(caught.value) and str(tmp_path / name) in str(caught.value)
 
 
 def test_missing_files_and_folders_as_files(tmp_path: Path) -> None:

@@ -8,69 +8,19 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
 from datagen.mesh.formats.obj import ObjContent, face_lines, vertex_lines
+from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
 
-CUBE = b"""# made by hand, caf\xe9
-mtllib look.mtl
-o person
-v 0 0 0 0.1 0.2 0.3
-v 1 0 0 0.1 0.2 0.3
-v 1 1 0 0.1 0.2 0.3
-v 0 1 0 0.1 0.2 0.3
-v 0 0 1 0.1 0.2 0.3
-v 1 0 1 0.1 0.2 0.3
-v 1 1 1 0.1 0.2 0.3
-v 0 1 1 0.1 0.2 0.3
-vt 0 0
-vt 1 0
-vt 1 1
-vt 0 1
-vn 0 0 -1
-vn 0 0 1
-vn 0 -1 0
-vn 1 0 0
-vn 0 1 0
-vn -1 0 0
-g sides
-usemtl skin
-s off
-f 4/1/1 3/2/1 2/3/1 1/4/1
-f 5/1/2 6/2/2 7/3/2 8/4/2
-usemtl cloth
-s 1
-f 1/1/3 2/2/3 6/3/3 5/4/3
-f -7/1/4 -6/2/4 -2/3/4 -3/4/4 # from the end
-g rest
-f 3/1/5 4/2/5 8/3/5 7/4/5
-f 4/1/6 1/2/6 5/3/6 8/4/6
-"""
-LOOK = b"newmtl skin\nKd 1 0.5 0.25\nmap_Kd -clamp on skin of me.png\nnewmtl cloth\nKd 0 0 1\nd 0.5\n"
-PNG = b"\x89PNG\r\n\x1a\n and so on"
-
-
-def cube(folder: Path) -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "cube.obj").write_bytes(CUBE)
-    (folder / "look.mtl").write_bytes(LOOK)
-    (folder / "skin of me.png").write_bytes(PNG)
-    return folder / "cube.obj"
+CUBE, LOOK = ((GOLDEN / name).read_bytes() for name in ("cube.obj", "look.mtl"))
 
 
 def lines_of(content: bytes, *starts: bytes) -> list[bytes]:
     return [line for line in content.splitlines() if line.split(b" ")[0] in starts]
 
 
-def test_vertices_faces_name_and_fans_of_quads(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
-    assert read.name == "person" and read.mesh.vertices.shape == (8, 3)
-    assert read.mesh.faces[:2].tolist() == [[3, 2, 1], [3, 1, 0]] and len(read.mesh.faces) == 12
-    assert read.mesh.faces[6].tolist() == [1, 2, 6]
-
-
 def test_all_but_positions_and_normals_stays_as_it_is(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     moved = read.mesh.vertices * (1, 2, 3) + 0.123456789
     assert write_posed(read, moved, tmp_path / "posed.obj") == []
     written = (tmp_path / "posed.obj").read_bytes()
@@ -86,7 +36,7 @@ def test_all_but_positions_and_normals_stays_as_it_is(tmp_path: Path) -> None:
 
 def test_a_hard_edge_stays_hard_and_normals_follow_the_pose(tmp_path: Path) -> None:
     """A cube sheared along x has other sides; the six normals of its file are shared by four vertices each."""
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     sheared = read.mesh.vertices + read.mesh.vertices[:, [1, 0, 0]] * (1, 0, 0)
     write_posed(read, sheared, tmp_path / "posed.obj")
     loaded = trimesh.load(tmp_path / "posed.obj", process=False, maintain_order=True, force="mesh")
@@ -121,7 +71,7 @@ def test_faces_without_normals_among_faces_with_them_stay_so(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("ending", [b"\r\n", b"\r"])
 def test_line_ends_of_other_systems_stay(tmp_path: Path, ending: bytes) -> None:
-    path = cube(tmp_path)
+    path = golden("cube.obj", tmp_path)
     path.write_bytes(CUBE.replace(b"\n", ending))
     read = read_mesh_file(path)
     write_posed(read, read.mesh.vertices, tmp_path / "same.obj")
@@ -130,16 +80,8 @@ def test_line_ends_of_other_systems_stay(tmp_path: Path, ending: bytes) -> None:
     assert read_mesh_file(tmp_path / "same.obj").mesh.faces.tolist() == read.mesh.faces.tolist()
 
 
-def test_continued_lines_marks_of_utf8_tabs_and_indents(tmp_path: Path) -> None:
-    text = b"\xef\xbb\xbfv 0 0 0\n\tv\t1 0\t0\n  v 0 1 0\nv 0 0 \\\n 1\nf 1 2 \\\r\n3\nf 1 2 4\nf 2/ 3/ 4/\n"
-    (tmp_path / "odd.obj").write_bytes(text)
-    read = read_mesh_file(tmp_path / "odd.obj")
-    assert read.mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    assert read.mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3], [1, 2, 3]]
-
-
 def test_materials_and_textures_go_along_to_another_folder_and_spare_what_is_there(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path / "mine"))
+    read = read_mesh_file(golden("cube.obj", tmp_path / "mine"))
     assert write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj") == []
     assert (tmp_path / "other" / "look.mtl").read_bytes() == LOOK
     assert (tmp_path / "other" / "skin of me.png").read_bytes() == PNG
@@ -149,7 +91,7 @@ def test_materials_and_textures_go_along_to_another_folder_and_spare_what_is_the
 
 
 def test_materials_in_a_folder_below_and_those_that_are_not_there(tmp_path: Path) -> None:
-    path = cube(tmp_path / "mine")
+    path = golden("cube.obj", tmp_path / "mine")
     (tmp_path / "mine" / "m").mkdir()
     (tmp_path / "mine" / "m" / "look.mtl").write_bytes(LOOK)
     (tmp_path / "mine" / "m" / "skin of me.png").write_bytes(PNG)
@@ -159,28 +101,6 @@ def test_materials_in_a_folder_below_and_those_that_are_not_there(tmp_path: Path
     assert (tmp_path / "other" / "m" / "skin of me.png").read_bytes() == PNG
     assert len(notes) == 2 and "gone.mtl is not beside" in notes[1]
     assert "../up.mtl was not copied: it lies outside of the mesh's folder" in notes[0]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 9\n", "names vertex 9, but there are 4"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 0 1 2\n", "names vertex 0, but there are 4"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf -9 1 2\n", "names vertex"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1/7 2/7 3/7\n", "names texture coordinate 7"),
-        (b"v 0 0 0\nv 1 zero 0\nv 0 1 0\nf 1 2 3\n", "line 2 is not 3 numbers: 'v 1 zero 0'"),
-        (b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2 is not 3 numbers"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf one two three\n", "cannot be read as OBJ: .*one"),
-        ("v 0 0 0\n".encode("utf-16"), "UTF-16"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n", "no faces"),
-        (b"nothing of use\n", "holds no mesh"),
-    ],
-)
-def test_broken_files_say_in_one_line_what_is_wrong(tmp_path: Path, text: bytes, message: str) -> None:
-    (tmp_path / "bad.obj").write_bytes(text)
-    with pytest.raises(MeshError, match=message) as caught:
-        read_mesh_file(tmp_path / "bad.obj")
-    assert "\n" not in str(caught.value) and str(tmp_path / "bad.obj") in str(caught.value)
 
 
 @settings(max_examples=50)

@@ -18,8 +18,7 @@ from datagen.mesh.formats import glb_writer as mesh_glb_written
 from datagen.mesh.formats.gltf import Gltf
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import frames_of, is_pattern, write_animation
-from tests.datagen.mesh.test_glb import saved, scene, sound
-from tests.datagen.mesh.test_obj import PNG, cube
+from tests.support.shapes.mesh_files import PNG, golden, scene, sound
 
 
 def shown(path: Path, seconds: float) -> list[tuple[NDArray[Any], NDArray[Any]]]:
@@ -54,7 +53,7 @@ def moves(read: MeshFile, count: int) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "STEP"])
 def test_each_frame_is_shown_at_its_time(tmp_path: Path, interpolation: str) -> None:
-    read = read_mesh_file(saved(scene(), tmp_path))
+    read = read_mesh_file(scene().save(tmp_path / "scene.glb"))
     frames = moves(read, 6)
     write_animation(read, frames, tmp_path / "moving.glb", frames_per_second=25, interpolation=interpolation)
     sound(tmp_path / "moving.glb")
@@ -69,7 +68,7 @@ def test_each_frame_is_shown_at_its_time(tmp_path: Path, interpolation: str) -> 
 
 
 def test_materials_and_texture_coordinates_of_an_obj_move_along(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     frames = moves(read, 3)
     write_animation(read, iter(frames), tmp_path / "moving.glb", frames_per_second=10)
     described = sound(tmp_path / "moving.glb")
@@ -82,7 +81,7 @@ def test_materials_and_texture_coordinates_of_an_obj_move_along(tmp_path: Path) 
 
 
 def test_bounds_of_morph_targets_are_stated(tmp_path: Path) -> None:
-    read = read_mesh_file(saved(scene(), tmp_path))
+    read = read_mesh_file(scene().save(tmp_path / "scene.glb"))
     write_animation(read, moves(read, 3), tmp_path / "moving.glb", frames_per_second=10)
     described = sound(tmp_path / "moving.glb")
     for target in described["meshes"][0]["primitives"][0]["targets"]:
@@ -112,14 +111,14 @@ def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
 
 
 def test_one_frame_is_a_still(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     write_animation(read, moves(read, 1), tmp_path / "still.glb", frames_per_second=10)
     assert "animations" not in sound(tmp_path / "still.glb")
     assert np.allclose(read_mesh_file(tmp_path / "still.glb").mesh.vertices[:8], read.mesh.vertices)
 
 
 def test_what_cannot_be_an_animation_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = read_mesh_file(cube(tmp_path / "in"))
+    read = read_mesh_file(golden("cube.obj", tmp_path / "in"))
     frames, out = moves(read, 3), tmp_path / "out" / "moving.glb"
 
     def failing() -> Iterator[NDArray[np.float64]]:
@@ -178,7 +177,7 @@ def test_places_without_frames(tmp_path: Path) -> None:
 
 
 def test_the_header_counts_what_streams_behind_it(tmp_path: Path) -> None:
-    read = read_mesh_file(cube(tmp_path))
+    read = read_mesh_file(golden("cube.obj", tmp_path))
     write_animation(read, moves(read, 40), tmp_path / "moving.glb", frames_per_second=10)
     content = (tmp_path / "moving.glb").read_bytes()
     length = struct.unpack_from("<I", content, 12)[0]
