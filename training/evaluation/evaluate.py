@@ -24,7 +24,7 @@ from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of
 from training.evaluation.measure import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
-from training.evaluation.method_names import method_name, needs_equal_counts
+from training.evaluation.paper_numbers import method_name, needs_equal_counts
 from training.evaluation.results import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows
 from training.recipes.training import EvaluationRecipe, NetworkRecipe
 

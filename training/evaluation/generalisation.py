@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError
 from datagen.store import Dataset
-from training.evaluation.measure import POSE_TYPES, LoadedMethod, Score, mean_and_interval, normalised, transfer_each
-from training.evaluation.results import kept_rows, write_csv
-from training.evaluation.robustness import NO_OP, Case, case_of
-from training.evaluation.tables import markdown
+from training.evaluation.document import Table
+from training.evaluation.measure import POSE_TYPES, LoadedMethod, normalised, transfer_each
+from training.evaluation.results import Score, Triple, kept_rows, write_csv
+from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of
+from training.evaluation.statistics import mean
 
 
 @dataclass(frozen=True)
@@ -57,31 +58,29 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class GeneralisationRow:
-    """One method on one triple from a kind of source to a kind of target."""
+class Between:
+    """Which method, and from which kind of mesh to which."""
 
     method: str
     source_kind: str
     target_kind: str
-    triple: int
-    source_identity: int
-    source_pose: int
-    target_identity: int
-    target_pose: int
-    source_vertices: int
-    target_vertices: int
-    pmd: float
-    pmd_recentred: float
-    chamfer: float
-    earth_mover: float
-    millimetres: float
-    edge_ratio: float
-    normal_degrees: float
 
     @property
     def key(self) -> tuple[str, str, str]:
         """What belongs together: method, kind of source, kind of target."""
         return self.method, self.source_kind, self.target_kind
+
+
+@dataclass(frozen=True)
+class Counts(SourceCount):
+    """Vertices of source and target."""
+
+    target_vertices: int
+
+
+@dataclass(frozen=True)
+class GeneralisationRow(Score, Counts, Triple, Between):
+    """One method on one triple from a kind of source to a kind of target."""
 
 
 def have_truth(source: Kind, target: Kind) -> bool:
@@ -154,7 +153,7 @@ def grid_of(
     for row in rows:
         if row.method == method:
             found.setdefault((row.source_kind, row.target_kind), []).append(getattr(row, field))
-    means = {pair: mean_and_interval(values)[0] for pair, values in found.items()}
+    means = {pair: mean(values) for pair, values in found.items()}
     return np.array([[means.get((source, target), np.nan) for target in kinds] for source in kinds])
 
 
@@ -167,13 +166,13 @@ def no_op_line(rows: Sequence[GeneralisationRow], kinds: Sequence[str], field: s
 
 def grid_table(
     rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str, *, field: str = "pmd", factor: float = 1e4
-) -> str:
-    """Markdown: the grid of one method, sources down, targets across, and the no-op as the last line."""
+) -> Table:
+    """The grid of one method, sources down, targets across, and the no-op as the last line."""
     lines = [["source \\ target", *kinds]]
     for kind, means in zip(kinds, grid_of(rows, kinds, method, field), strict=True):
         lines.append([kind, *(_cell(value, factor) for value in means)])
     lines.append([NO_OP, *(_cell(value, factor) for value in no_op_line(rows, kinds, field))])
-    return markdown(lines)
+    return Table(lines)
 
 
 def _cell(value: float, factor: float) -> str:

@@ -5,7 +5,7 @@ The no-op baselines say what a method that does nothing would score: ``target un
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -21,28 +21,12 @@ from datagen.grid import PoseType
 from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
-from training.evaluation.method_names import method_name, needs_equal_counts
-from training.evaluation.results import Row
+from training.evaluation.paper_numbers import method_name, needs_equal_counts
+from training.evaluation.results import Row, Score
 from training.inference.predict import load_trained, predict
 from training.objectives import metrics
 from training.recipes.training import EvaluationRecipe
 
-
-@dataclass(frozen=True)
-class Score:
-    """Metrics of one output, as the last fields of :class:`training.evaluation.results.Row`; NaN: not measured, or
-    not finite."""
-
-    pmd: float
-    pmd_recentred: float
-    chamfer: float
-    earth_mover: float
-    millimetres: float
-    edge_ratio: float
-    normal_degrees: float
-
-
-METRICS = tuple(field.name for field in fields(Score))
 NO_OPS = ("target unchanged", "source unchanged")
 POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 
@@ -281,14 +265,6 @@ def score(
 def _edges(faces: bytes) -> NDArray[np.int64]:
     """Edges of int64 faces, which the triples of a topology share: sorting them takes longer than the metrics."""
     return edges_of(np.frombuffer(faces, np.int64).reshape(-1, 3))
-
-
-def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval: 1.96 standard errors (0 for one value)."""
-    numbers = np.asarray(values, np.float64)
-    if len(numbers) < 2:
-        return float(numbers.mean()) if len(numbers) else float("nan"), 0.0
-    return float(numbers.mean()), float(1.96 * numbers.std(ddof=1) / np.sqrt(len(numbers)))
 
 
 def in_words(score: Score) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from training.recipes.training import CoreNet3dRecipe, NetworkRecipe, NptRecipe
+
 PaperData = Literal["SMPL", "SMAL"]
 """Humans and animals of the paper."""
 
@@ -74,3 +76,19 @@ TABLE_3: Mapping[str, SeenUnseen] = {
     WITHOUT_EDGE_LOSS: SeenUnseen(Scores(0.91, 3.67, 22.49), Scores(2.12, 7.82, 42.63)),
 }
 """Table 3 (SMPL) by ablation, the full DSFFNet first."""
+
+
+def method_name(network: NetworkRecipe) -> str:
+    """What tables call a network, by its recipe: the paper's name, with what is left out or differs behind it."""
+    if isinstance(network, CoreNet3dRecipe):
+        return CORENET3D
+    if isinstance(network, NptRecipe):
+        return NPT if network.variant == "maxpool" else f"{NPT} {network.variant}"
+    if not network.feature_fusion:
+        return f"{DSFFNET} {WITHOUT_FUSION}"
+    return DSFFNET if network.target_side else f"{DSFFNET} {WITHOUT_TARGET_SIDE}"
+
+
+def needs_equal_counts(network: NetworkRecipe) -> bool:
+    """Whether a network pairs source and target by index, so that both must have as many vertices."""
+    return isinstance(network, NptRecipe) and network.variant == "origin"

@@ -89,19 +89,9 @@ _PIECE = re.compile(r"(seen|unseen)-\d{5,}-[0-9a-f]{32}\.csv")
 
 
 @dataclass(frozen=True, order=True)
-class Row:
-    """One method on one evaluation triple. Metrics are in the normalised box unless their name says otherwise.
+class Score:
+    """Metrics of one output, in the normalised box unless their name says otherwise; NaN: not measured, not finite."""
 
-    A metric is NaN where the method's output was not finite.
-    """
-
-    method: str
-    pose_type: str
-    triple: int
-    source_identity: int
-    source_pose: int
-    target_identity: int
-    target_pose: int
     pmd: float
     pmd_recentred: float
     chamfer: float
@@ -109,6 +99,33 @@ class Row:
     millimetres: float
     edge_ratio: float
     normal_degrees: float
+
+
+@dataclass(frozen=True, order=True)
+class Triple:
+    """Number of an evaluation triple, and what it is of: source (identity, pose) and target (identity, pose)."""
+
+    triple: int
+    source_identity: int
+    source_pose: int
+    target_identity: int
+    target_pose: int
+
+
+@dataclass(frozen=True, order=True)
+class Listed:
+    """Which method, and which of the dataset's two lists of triples."""
+
+    method: str
+    pose_type: str
+
+
+@dataclass(frozen=True, order=True)
+class Row(Score, Triple, Listed):
+    """One method on one evaluation triple. Fields come in the order of a file's columns: the last base's first."""
+
+
+METRICS = tuple(field.name for field in fields(Score))
 
 
 def write_rows(rows: list[Row], path: Path) -> None:

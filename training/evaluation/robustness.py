@@ -1,4 +1,4 @@
-"""How a trained network bears a spoilt source (paper, Figure 9): rows. Curves and tables: ``robustness_tables``.
+"""How a trained network bears a disturbed source (paper, Figure 9): rows, curves and tables.
 
 The source alone is disturbed, before its normalisation, as a person's mesh would be; target and ground truth stay as
 they are. The no-op ``target unchanged`` says what doing nothing would score, whatever the source.
@@ -17,18 +17,10 @@ from datagen.common.errors import DatasetError
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.store import Dataset
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
-from training.evaluation.measure import (
-    NO_OPS,
-    POSE_TYPES,
-    LoadedMethod,
-    Score,
-    mean_and_interval,
-    normalised,
-    score,
-    transfer_each,
-)
-from training.evaluation.results import kept_rows, write_csv
-from training.evaluation.tables import markdown
+from training.evaluation.document import Table
+from training.evaluation.measure import NO_OPS, POSE_TYPES, LoadedMethod, normalised, score, transfer_each
+from training.evaluation.results import Score, Triple, kept_rows, write_csv
+from training.evaluation.statistics import mean, mean_and_interval
 
 NO_OP = NO_OPS[0]
 
@@ -60,30 +52,29 @@ class Case:
 
 
 @dataclass(frozen=True)
-class RobustnessRow:
-    """One method on one triple whose source was disturbed. Metrics as in :class:`training.evaluation.evaluate.Row`."""
+class Disturbed:
+    """Which method, and how its sources were disturbed."""
 
     method: str
     disturbance: str
     amount: float
-    triple: int
-    source_identity: int
-    source_pose: int
-    target_identity: int
-    target_pose: int
-    source_vertices: int
-    pmd: float
-    pmd_recentred: float
-    chamfer: float
-    earth_mover: float
-    millimetres: float
-    edge_ratio: float
-    normal_degrees: float
 
     @property
     def key(self) -> tuple[str, str, float]:
         """What belongs together: method, disturbance, amount."""
         return self.method, self.disturbance, self.amount
+
+
+@dataclass(frozen=True)
+class SourceCount:
+    """Vertices of the source."""
+
+    source_vertices: int
+
+
+@dataclass(frozen=True)
+class RobustnessRow(Score, SourceCount, Triple, Disturbed):
+    """One method on one triple whose source was disturbed."""
 
 
 def cases_of(dataset: Dataset, count: int) -> list[Case]:
@@ -198,11 +189,12 @@ def read_rows(path: Path) -> list[RobustnessRow]:
 
 @dataclass(frozen=True)
 class Level:
-    """Mean of a metric over the triples at one amount, and half the width of its 95 % interval."""
+    """Mean of a metric over the triples at one amount, and the ends of its 95 % interval."""
 
     amount: float
     mean: float
-    interval: float
+    low: float
+    high: float
 
 
 def curve(rows: Sequence[RobustnessRow], method: str, disturbance: str, field: str = "pmd") -> list[Level]:
@@ -216,7 +208,7 @@ def curve(rows: Sequence[RobustnessRow], method: str, disturbance: str, field: s
 
 def no_op(rows: Sequence[RobustnessRow], field: str = "pmd") -> float:
     """What returning the target unchanged scores."""
-    return mean_and_interval([getattr(row, field) for row in rows if row.method == NO_OP])[0]
+    return mean(getattr(row, field) for row in rows if row.method == NO_OP)
 
 
 def doubled(levels: Sequence[Level]) -> float | None:
@@ -224,8 +216,8 @@ def doubled(levels: Sequence[Level]) -> float | None:
     return next((level.amount for level in levels if level.mean >= 2 * levels[0].mean), None)
 
 
-def limits_table(rows: Sequence[RobustnessRow]) -> str:
-    """Markdown: for each disturbance the amount at which each method's PMD has doubled, and the PMD at the most."""
+def limits_table(rows: Sequence[RobustnessRow]) -> Table:
+    """For each disturbance the amount at which each method's PMD has doubled, and the PMD at the most."""
     names = methods_in(rows)
     heads = [head for name in names for head in (f"{name}: doubled at", "PMD at the most")]
     lines = [["disturbance", "amount (unit)", *heads]]
@@ -234,7 +226,7 @@ def limits_table(rows: Sequence[RobustnessRow]) -> str:
         if any(curves):
             span = f"{disturbance.amounts[0]:g} to {disturbance.amounts[-1]:g} ({disturbance.unit})"
             lines.append([disturbance.heading, span, *(cell for levels in curves for cell in _limit(levels))])
-    return markdown(lines)
+    return Table(lines, "Where it breaks")
 
 
 def _limit(levels: Sequence[Level]) -> tuple[str, str]:
@@ -244,10 +236,10 @@ def _limit(levels: Sequence[Level]) -> tuple[str, str]:
     return "never" if amount is None else f"{amount:g}", f"{levels[-1].mean * 1e4:.2f}"
 
 
-def amounts_table(rows: Sequence[RobustnessRow]) -> str:
-    """Markdown: PMD (1e-4) and millimetres of every method at every amount of every disturbance."""
+def amounts_table(rows: Sequence[RobustnessRow]) -> Table:
+    """PMD (1e-4) with its interval and millimetres of every method at every amount of every disturbance."""
     names = methods_in(rows)
-    lines = [["disturbance", "amount", *(head for name in names for head in (f"{name} PMD x1e-4", "+- 95 %", "mm"))]]
+    lines = [["disturbance", "amount", *(head for name in names for head in (f"{name} PMD x1e-4", "95 %", "mm"))]]
     for disturbance in DISTURBANCES:
         pmd = {name: curve(rows, name, disturbance.name) for name in names}
         metres = {name: curve(rows, name, disturbance.name, "millimetres") for name in names}
@@ -255,11 +247,11 @@ def amounts_table(rows: Sequence[RobustnessRow]) -> str:
         for amount in amounts:
             cells = [cell for name in names for cell in _cells(pmd[name], metres[name], amount)]
             lines.append([disturbance.heading, f"{amount:g}", *cells])
-    return markdown(lines)
+    return Table(lines, "Every amount", "Mean over triples, with its 95 % interval.")
 
 
 def _cells(pmd: Sequence[Level], millimetres: Sequence[Level], amount: float) -> tuple[str, str, str]:
     for level, distance in zip(pmd, millimetres, strict=True):
         if level.amount == amount:
-            return f"{level.mean * 1e4:.2f}", f"{level.interval * 1e4:.2f}", f"{distance.mean:.1f}"
+            return f"{level.mean * 1e4:.2f}", f"{level.low * 1e4:.2f} to {level.high * 1e4:.2f}", f"{distance.mean:.1f}"
     return "", "", ""

@@ -18,6 +18,12 @@ def values_of(rows: Iterable[Row], *, method: str, pose_type: str, field: str) -
     return {row.triple: getattr(row, field) for row in rows if (row.method, row.pose_type) == (method, pose_type)}
 
 
+def mean(values: Iterable[float]) -> float:
+    """The mean; NaN of no values."""
+    numbers = np.fromiter(values, np.float64)
+    return float(numbers.mean()) if len(numbers) else float("nan")
+
+
 def interval(values: Iterable[float]) -> tuple[float, float] | None:
     """The 95 % percentile-bootstrap interval of a mean, the same each time; None for fewer than two values."""
     numbers = np.fromiter(values, np.float64)
@@ -26,6 +32,12 @@ def interval(values: Iterable[float]) -> tuple[float, float] | None:
     drawn = np.random.default_rng(0).integers(len(numbers), size=(_DRAWS, len(numbers)))
     low, high = np.quantile(numbers[drawn].mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
+
+
+def mean_and_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """The mean and the ends of :func:`interval`, which are the mean itself where there is none."""
+    middle = mean(values)
+    return middle, *(interval(values) or (middle, middle))
 
 
 def differences(rows: Sequence[Row], *, method: str, reference: str, pose_type: str, field: str) -> list[float]:

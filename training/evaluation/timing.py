@@ -51,7 +51,7 @@ class Inference:
     rounds: int
     threads: int
     device: str
-    mean: float = float("nan")
+    mean: float
 
 
 def measure_inference(

@@ -14,11 +14,13 @@ from datagen.store.verify import describe
 from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.folder import AVERAGE, WEIGHTS
+from training.evaluation.document import Table, Text, plain
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row
+from training.evaluation.run_curves import run_curve
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
 from training.networks import network_from
 from training.recipes.training import NptRecipe, TrainingRecipe
-from training.reports.blocks import Block, Code, Facts, Picture, Section, Table, Text, shown
+from training.reports.blocks import Block, Code, Facts, Picture, Section, shown
 from training.reports.card_texts import (
     DATASET_LIMITS,
     DATASET_USE,
@@ -33,8 +35,6 @@ from training.reports.card_texts import (
     span,
     vertex_counts,
 )
-from training.reports.markup import plain
-from training.reports.plots.sweep import run_curve
 from training.reports.run_summary import duration
 from training.tracking.journal import read_journal
 from training.tracking.provenance import provenance_of
@@ -117,7 +117,7 @@ def _changed(recipe: TrainingRecipe) -> Table:
 def _results(rows: list[Row]) -> list[Block]:
     if not rows:
         return [Text("### Results\n\nNot evaluated yet: `dsffnet evaluate RUN --data X.zarr`.")]
-    lines = [line for line in summary(rows) if line[1] not in NO_OPS]
+    lines = [line for line in summary(rows).lines if line[1] not in NO_OPS]
     return [Table(lines, "Results on new identities", "Lower is better; definitions stand by the main table.")]
 
 

@@ -62,11 +62,6 @@ def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: 
             save_mesh(Mesh(mesh.vertices, mesh.faces), folder / "meshes" / f"{number:02d}-{role}.glb")
 
 
-def draw_examples(examples: Sequence[Comparison], folder: Path, *, title: str) -> None:
-    """:func:`draw_comparisons`."""
-    draw_comparisons(examples, folder, title=title)
-
-
 def draw_training_curve(run: Path, path: Path, *, baselines: dict[str, float]) -> None:
     """Loss and evaluation PMD over the steps of a run; ``baselines`` are dashed lines."""
     training_curve(read_journal(run / "metrics.jsonl"), path, baselines=baselines)

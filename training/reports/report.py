@@ -9,25 +9,27 @@ from dataclasses import replace
 from pathlib import Path
 
 from datagen.common.errors import ReportError
-from datagen.common.files import read_text_within, write_atomically
+from datagen.common.files import write_atomically
 from datagen.common.printable import printable_lines
 from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import require_checkpoint
 from training.checkpoints.compat import recipe_of
+from training.evaluation.document import Cell, Table, Text, plain, with_best
 from training.evaluation.evaluate import Row, read_rows
-from training.evaluation.tables import mean_of, methods_of
-from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, Table, Text, shown, with_best
+from training.evaluation.tables import about_weights, mean_of, methods_of, results
+from training.recipes.training import EvaluationRecipe
+from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, shown
 from training.reports.card_texts import NETWORKS, span, vertex_counts
 from training.reports.cards import dataset_card, model_card
 from training.reports.html import report_html
 from training.reports.markdown import report_markdown
-from training.reports.markup import document_blocks, plain
 from training.reports.run_summary import this_commit, this_machine, what_was_run
 from training.tracking.record import read_record
 
 __all__ = [
     "NAMES",
     "Block",
+    "Cell",
     "Code",
     "Facts",
     "Page",
@@ -37,12 +39,10 @@ __all__ = [
     "Table",
     "Text",
     "dataset_card",
-    "document_blocks",
     "model_card",
     "pictures_of",
     "plain",
     "report_is_current",
-    "report_of_sweep",
     "this_commit",
     "this_machine",
     "what_was_run",
@@ -75,7 +75,7 @@ def write_report(
     folder
         Where the report goes; pages and, in Markdown, pictures are linked relative to it.
     title, lead
-        Plain text; markup (see :mod:`training.reports.markup`) of what a hurried reader is to know.
+        Plain text; markup (see :mod:`training.evaluation.document`) of what a hurried reader is to know.
     sections
         In their order; the HTML lists their titles.
 
@@ -113,7 +113,7 @@ def workflow_report(out: Path) -> tuple[Path, Path]:
     dataset, rows = open_dataset(str(out / "dataset.zarr")), read_rows(evaluation / "rows.csv")
     sections = [
         what_was_run(out),
-        Section("Results", _tables(evaluation / "tables.md")),
+        Section("Results", _results(out, dataset, rows)),
         Section("Examples", (*pictures_of(evaluation / "figures", but=("training-curve",)), *_viewer(evaluation))),
         Section("Training", _curves(out / "run")),
         dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
@@ -122,34 +122,6 @@ def workflow_report(out: Path) -> tuple[Path, Path]:
     ]
     sections = [section for section in sections if section.body]
     return write_report(out, title=_title(record.name, dataset), lead=_lead(out, dataset, rows), sections=sections)
-
-
-def report_of_sweep(out: Path) -> tuple[Path, Path]:
-    """The report of what ``dsffnet sweep`` leaves in ``out``, also while trials still run: table, figure, trials, data.
-
-    Raises
-    ------
-    ReportError
-        There is no sweep's table.
-    DatasetError
-        The dataset is missing or incomplete.
-    """
-    table, record = out / "sweep.md", read_record(out)
-    if record is None or not table.is_file():
-        missing = table.name if record else "record.json"
-        raise ReportError(
-            f"{out} holds no sweep (no {missing}). Begin one: dsffnet sweep --trials networks --out {out}"
-        )
-    dataset = open_dataset(str(out / "dataset.zarr"))
-    results = (*document_blocks(read_text_within(out, table.name)), *pictures_of(out / "figures"))
-    sections = [
-        Section("Results", results),
-        what_was_run(out),
-        dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
-    ]
-    counts = span(vertex_counts(dataset))
-    lead = f"Trainings side by side on {plain(dataset.recipe.body.family)} bodies of {counts} vertices, best first."
-    return write_report(out, title=f"Sweep {record.name}", lead=lead, sections=sections)
 
 
 def report_is_current(out: Path) -> bool:
@@ -167,17 +139,25 @@ def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]
     return tuple(Picture(path, CAPTIONS.get(path.stem, plain(path.stem.replace("-", " ")))) for path in paths)
 
 
-def _tables(path: Path) -> tuple[Block, ...]:
-    """The tables of an evaluation, with its definitions as it wrote them; the best values are marked."""
-    blocks = document_blocks(read_text_within(path.parent, path.name))
-    return tuple(_marked(block) if isinstance(block, Table) else block for block in blocks)
+def _results(out: Path, dataset: Dataset, rows: Sequence[Row]) -> tuple[Block, ...]:
+    """The evaluation's table with its definitions; the best values are marked."""
+    about = about_weights(require_checkpoint(out / "run", "result").step, dataset)
+    parts = results(rows, about=about, emd_points=_emd_points(out / "run" / "evaluation", dataset))
+    return tuple(_marked(part) if isinstance(part, Table) else part for part in parts)
+
+
+def _emd_points(evaluation: Path, dataset: Dataset) -> int:
+    """Vertices that the earth mover's distance was measured over: as many as asked for, or all."""
+    record = read_record(evaluation)
+    asked = record.parameters.get("emd_points", "") if record else ""
+    known = int(asked) if asked.isdecimal() and len(asked) < 18 else EvaluationRecipe().emd_points
+    return min(known, max(vertex_counts(dataset, "evaluation")))
 
 
 def _marked(table: Table) -> Table:
     columns = [place for place, numeric in enumerate(table.numeric) if numeric]
-    group = 0 if not table.numeric[0] else None
-    lines = with_best(table.lines, columns=columns, group=group)
-    return replace(table, lines=lines, notes=table.notes or "The best of each column and group of poses in bold.")
+    lines = with_best(table.lines, columns=columns, group=0)
+    return replace(table, lines=lines, notes="The best of each column and group of poses in bold.")
 
 
 def _viewer(evaluation: Path) -> tuple[Page, ...]:

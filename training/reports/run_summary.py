@@ -19,7 +19,8 @@ from typing_extensions import TypedDict
 from datagen.common.errors import DamagedFileError, ReportError, UnsafeFileError
 from datagen.common.files import read_text_within
 from datagen.common.json_files import read_json
-from training.reports.blocks import Block, Code, Facts, Section, Table, shown
+from training.evaluation.document import Table
+from training.reports.blocks import Block, Code, Facts, Section, shown
 from training.tracking.journal import read_journal
 from training.tracking.provenance import Provenance, provenance_of
 from training.tracking.record import Record, find_records, read_record

@@ -5,16 +5,16 @@ from pathlib import Path
 
 from datagen.common.files import read_text_within
 from datagen.store import Dataset, open_dataset
+from training.evaluation.document import Text, plain
 from training.evaluation.evaluate import NO_OPS, Row, read_rows
 from training.evaluation.tables import emphasised
-from training.reports.blocks import Block, Code, Page, Picture, Section, Table, Text
+from training.reports.blocks import Block, Code, Page, Picture, Section
 from training.reports.cards import dataset_card, model_card
-from training.reports.markup import plain
 from training.reports.report import write_report
 from training.reports.run_summary import what_was_run
 from workflows.comparison.evaluate import FOLDER, read_inference
 from workflows.comparison.plan import ComparisonPlan
-from workflows.comparison.tables import NamedTable, tables_of
+from workflows.comparison.tables import tables_of
 from workflows.sweep.plan import Trial
 
 REPORT = "report.md"
@@ -30,7 +30,7 @@ def write_comparison_report(plan: ComparisonPlan, out: Path, runs: Mapping[str, 
     dataset, rows = open_dataset(str(out / "dataset.zarr")), read_rows(out / FOLDER / "rows.csv")
     tables = tables_of(plan, dataset, runs, rows, read_inference(out))
     sections = [
-        Section("Results", tuple(_table(table) for table in tables)),
+        Section("Results", tuple(map(emphasised, tables))),
         Section("Figures", tuple(_figures(out / FOLDER))),
         Section("What was compared", (Text(_methods(plan)), *((Code(command),) if command else ()))),
         what_was_run(out),
@@ -39,10 +39,6 @@ def write_comparison_report(plan: ComparisonPlan, out: Path, runs: Mapping[str, 
     ]
     write_report(out, title=plan.title, lead=plain(plan.description), sections=sections)
     return read_text_within(out / FOLDER, "tables.md")
-
-
-def _table(table: NamedTable) -> Block:
-    return Table(emphasised(table.lines), caption=plain(table.title), notes=table.notes)
 
 
 def _figures(folder: Path) -> list[Block]:

@@ -24,12 +24,11 @@ from training.data.triples import last_step_of, order_of
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_rows, triples_in, write_rows
-from training.evaluation.method_names import method_name
-from training.evaluation.tables import COLUMNS, mean_of, methods_of, report
+from training.evaluation.paper_numbers import method_name
+from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_of, report
 from training.inference.predict import load_trained
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
-from training.reports.examples import draw_examples, draw_training_curve, examples_of
-from training.reports.markup import plain
+from training.reports.examples import draw_comparisons, draw_training_curve, examples_of
 from training.reports.plots.training_curve import draw_coefficients
 from training.reports.run_summary import this_commit, this_machine
 from training.tracking.record import MODEL, Record, begin_record, end_record, flatten, read_record, update_record
@@ -165,10 +164,10 @@ def evaluate_stage(
             runner = tasks.measure(dataset, recipe)
             rows = evaluate([method], data, recipe, tasks=runner, keep=keep, progress=evaluation_bar)
         write_rows(rows, folder / "rows.csv")
-        about = f"Weights of step {step:,} on {plain(Path(dataset.url).name)} ({dataset.uuid})."
+        about = about_weights(step, dataset)
         text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
         write_atomically(folder / "tables.md", text.encode())
-        draw_examples(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
+        draw_comparisons(examples_of(dataset, network, recipe, rows), folder, title=_title(dataset))
         if (what.home / "metrics.jsonl").exists():  # exported weights have none
             path = folder / "figures" / "training-curve.png"
             draw_training_curve(what.home, path, baselines=_no_ops(rows))

@@ -9,11 +9,11 @@ from datagen.common.errors import RecipeError
 from datagen.common.files import write_atomically
 from datagen.recipe import AnnyTopology, DatasetRecipe
 from datagen.recipe.base import LARGEST
+from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.generalisation import (
     GeneralisationRow,
     Kind,
     cases_between,
-    grid_of,
     grid_table,
     have_truth,
     measured,
@@ -23,7 +23,6 @@ from training.evaluation.generalisation import (
 )
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.robustness import Case, methods_in
-from training.reports.markup import plain
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 from workflows.pipeline.console import print_text
 from workflows.pipeline.progress import bar
@@ -207,19 +206,20 @@ def report(
         f"{plain(method.name)}: step {method.step:,}, trained on {plain(own) or 'none of these kinds'}"
         for method, own in zip(methods, trained, strict=True)
     )
-    grids = "\n\n".join(
-        f"## {plain(name)}\n\nPMD x1e-4\n\n{grid_table(rows, names, name)}\n\nmm\n\n"
-        f"{grid_table(rows, names, name, field='millimetres', factor=1)}"
-        for name in methods_in(rows)
-        if grid_of(rows, names, name).size
-    )
-    return (
-        f"# Generalisation to other bodies and vertex counts\n\nWeights: {whose}. {sizes.identities} new identities in "
+    grids = [part for name in methods_in(rows) for part in _grids(rows, names, name)]
+    about = (
+        f"Weights: {whose}. {sizes.identities} new identities in "
         f"{sizes.poses} new poses of each kind, {sizes.triples} transfers a pair (a dataset of your own: its own "
         "triples). All Anny kinds are the same people; the stand-in in SMPL's format has people of its own in the same "
         "poses; animals have poses of their own, so that between them and people there is no ground truth. PMD: mean "
         "over vertices and coordinates of (output - truth)^2 in the normalised box; mm: mean distance of a vertex. "
         "Pairs down to across: source to target; –: no ground truth is known, or the network takes "
-        "no other vertex count.\n\n![heat map](heat-map.png)\n\n![examples](examples.png)\n\n"
-        f"{grids}\n"
+        "no other vertex count."
     )
+    pictures = Text("![heat map](heat-map.png)\n\n![examples](examples.png)")
+    return document_markdown("Generalisation to other bodies and vertex counts", (Text(about), pictures, *grids))
+
+
+def _grids(rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str) -> list[Text | Table]:
+    metres = grid_table(rows, kinds, method, field="millimetres", factor=1)
+    return [Text(f"## {plain(method)}\n\nPMD x1e-4"), grid_table(rows, kinds, method), Text("mm"), metres]

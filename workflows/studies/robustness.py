@@ -9,6 +9,7 @@ from datagen.common.errors import RecipeError
 from datagen.common.files import write_atomically
 from datagen.store import open_dataset
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
+from training.evaluation.document import Text, document_markdown, plain
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.robustness import (
     Case,
@@ -24,7 +25,6 @@ from training.evaluation.robustness import (
     steps,
     write_rows,
 )
-from training.reports.markup import plain
 from training.reports.plots.robustness import (
     disturbance_picture,
     millimetres,
@@ -161,17 +161,16 @@ def report(
     left_out = [_left_out(method, disturbances) for method in methods]
     start = ", ".join(f"{plain(its.name)} {_undisturbed(rows, its):.2f}" for its in methods)
     trained = "; ".join(f"{plain(method.name)}: step {method.step:,}" for method in methods)
-    return (
-        f"# Robustness to a disturbed source\n\nWeights: {trained}. Dataset {plain(data)}, its first {cases} "
+    about = (
+        f"Weights: {trained}. Dataset {plain(data)}, its first {cases} "
         "evaluation triples of new identities. Only the source is changed, before its normalisation; ground truth and "
         "target stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, times 1e4. "
         f"Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
-        f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m.\n\n"
-        f"## Where it breaks\n\n{limits_table(rows)}\n\n"
-        + "".join(left_out)
-        + f"![curves](curves.png)\n\n![noise](noise.png)\n\n![disturbances](disturbances.png)\n\n"
-        f"## Every amount\n\nMean over triples; +- is the half width of its 95 % interval.\n\n{amounts_table(rows)}\n"
+        f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m."
     )
+    pictures = Text("\n\n".join(f"![{name}]({name}.png)" for name in ("curves", "noise", "disturbances")))
+    parts = (Text(about), limits_table(rows), Text("".join(left_out)), pictures, amounts_table(rows))
+    return document_markdown("Robustness to a disturbed source", parts)
 
 
 def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:

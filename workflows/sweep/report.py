@@ -9,10 +9,17 @@ from pathlib import Path
 
 from datagen.common.errors import RecipeError
 from datagen.common.files import write_atomically
+from datagen.store import open_dataset
+from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.results import inert
-from training.evaluation.tables import markdown
-from training.reports.markup import plain
-from training.reports.plots.sweep import PMD_UNIT, RunCurve, run_curve, sweep_figure
+from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
+from training.reports.blocks import Section
+from training.reports.card_texts import span, vertex_counts
+from training.reports.cards import dataset_card
+from training.reports.plots.sweep import sweep_figure
+from training.reports.report import pictures_of
+from training.reports.report import write_report as write_page
+from training.reports.run_summary import what_was_run
 from training.tracking.journal import read_journal
 from training.tracking.record import read_record
 from workflows.sweep.plan import Sweep, Trial, varied_values
@@ -96,13 +103,13 @@ def named_levels(results: Sequence[Result], levels: Sequence[tuple[float, bool]]
 def write_report(
     sweep: Sweep, out: Path, *, name: str, levels: Sequence[tuple[float, bool]], cpus: int
 ) -> list[Result]:
-    """Write OUT/sweep.md, sweep.csv, figures/sweep.png and best.yaml from what the trials' journals say now."""
+    """Write what the trials' journals say now: sweep.md, sweep.csv, figures/sweep.png, best.yaml and the report."""
     from workflows.recipe.loader import save_recipe
 
     results = results_of(sweep, out)
     reach, best = named_levels(results, levels), best_of(results)
-    text = report(sweep, results, name=name, levels=reach, cpus=cpus)
-    write_atomically(out / "sweep.md", text.encode())
+    parts = parts_of(sweep, results, levels=reach, cpus=cpus)
+    write_atomically(out / "sweep.md", document_markdown(f"Sweep {name}", parts).encode())
     write_atomically(out / "sweep.csv", table_csv(sweep, results, reach).encode())
     curves = [result.unseen for result in results if len(result.unseen)]
     if curves:
@@ -111,30 +118,44 @@ def write_report(
     if best is not None:
         about = f"The best of sweep {name}: trial {best.trial.name}."
         save_recipe(best.trial.recipe.model_copy(update={"description": about}), out / "best.yaml")
+    _write_page(out, name, parts)
     return results
 
 
-def report(sweep: Sweep, results: Sequence[Result], *, name: str, levels: dict[str, float], cpus: int) -> str:
-    """The table as a Markdown document with its definitions, what each trial sets, and why some failed."""
+def _write_page(out: Path, name: str, parts: Sequence[Text | Table]) -> None:
+    """OUT/report.html and report.md: table, figure, trials, data."""
+    dataset = open_dataset(str(out / "dataset.zarr"))
+    sections = [
+        Section("Results", (*parts, *pictures_of(out / "figures"))),
+        what_was_run(out),
+        dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
+    ]
+    counts = span(vertex_counts(dataset))
+    lead = f"Trainings side by side on {plain(dataset.recipe.body.family)} bodies of {counts} vertices, best first."
+    write_page(out, title=f"Sweep {name}", lead=lead, sections=sections)
+
+
+def parts_of(
+    sweep: Sweep, results: Sequence[Result], *, levels: dict[str, float], cpus: int
+) -> tuple[Text | Table, ...]:
+    """The table with its definitions, what each trial sets, and why some failed."""
     best = best_of(results)
     threads = f"{cpus} thread{'s' if cpus > 1 else ''}"
     shared = {word.split("=", 1)[0]: word for word in sweep.words}.values()  # a key may be given twice; the last counts
     triples = min(sweep.recipe.training.evaluate_triples, sweep.recipe.data.triples.count)
-    parts = [
-        f"# Sweep {plain(name)}",
-        f"{len(results)} trainings from recipe {plain(sweep.recipe_name)}"
-        + (f" with {plain(' '.join(shared))}" if shared else "")
-        + ". Lower PMD is better.",
-        markdown(table(results, levels)),
+    words = f" with {plain(' '.join(shared))}" if shared else ""
+    described = [result.trial for result in results if result.trial.description]
+    after = [
         f"Best: **{best.trial.name}** ({plain(_words(best.trial))})." if best else "No trial has finished.",
         _DEFINITION.format(triples=triples, threads=threads),
+        "\n".join(f"- **{trial.name}**: {plain(f'{trial.description} ({_words(trial)})')}" for trial in described),
+        *(f"- **{each.trial.name}** failed: {plain(each.reason)}" for each in results if each.state == "failed"),
     ]
-    described = [result.trial for result in results if result.trial.description]
-    parts += [
-        "\n".join(f"- **{trial.name}**: {plain(f'{trial.description} ({_words(trial)})')}" for trial in described)
-    ]
-    parts += [f"- **{each.trial.name}** failed: {plain(each.reason)}" for each in results if each.state == "failed"]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return (
+        Text(f"{len(results)} trainings from recipe {plain(sweep.recipe_name)}{words}. Lower PMD is better."),
+        Table(table(results, levels)),
+        *(Text(part) for part in after if part),
+    )
 
 
 def table(results: Sequence[Result], levels: dict[str, float]) -> list[list[str]]:

@@ -13,8 +13,7 @@ from datagen.store import open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.data.triples import last_step_of
-from training.reports.plots.sweep import PMD_UNIT
-from training.reports.report import report_of_sweep
+from training.evaluation.run_curves import PMD_UNIT
 from training.tracking.record import has_record, read_record, update_record
 from workflows.pipeline.console import start_over
 from workflows.pipeline.ray_cluster import ray_cluster
@@ -147,7 +146,6 @@ def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None
 def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     """Write the report, and give the parent record what a person wants to see first: table, figure, best trial."""
     results = _write_report(sweep, out, settings)
-    report_of_sweep(out)
     record, best = read_record(out), best_of(results)
     assert record is not None
     metrics = {f"trials_{state}": float(sum(r.state == state for r in results)) for state in ("finished", "failed")}

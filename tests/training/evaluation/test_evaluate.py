@@ -20,7 +20,7 @@ from training.evaluation import evaluate as evaluation
 from training.evaluation import measure as measuring
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, measure_chunk, read_rows, triples_in, write_rows
 from training.evaluation.measure import Contender
-from training.evaluation.method_names import method_name
+from training.evaluation.paper_numbers import method_name
 from training.evaluation.tables import methods_of
 from training.inference.predict import load_trained, predict
 from training.inference.transfer import PoseTransfer

@@ -87,8 +87,8 @@ def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[Kind], rows: li
     assert np.isnan(grid).tolist() == [[False, False, True], [False, False, True], [True, True, False]]
     between = [row.pmd for row in rows if (row.source_kind, row.target_kind) == (names[0], names[1])]
     assert grid[0, 1] == pytest.approx(np.mean(between))
-    table = grid_table(rows, names, "DSFFNet").splitlines()
-    assert table[2].count("–") == 1 and f"{grid[0, 1] * 1e4:.1f}" in table[2] and NO_OP in table[-1]
+    table = grid_table(rows, names, "DSFFNet").lines
+    assert list(table[1]).count("–") == 1 and f"{grid[0, 1] * 1e4:.1f}" in table[1] and NO_OP in table[-1]
 
 
 def test_what_is_there_is_not_measured_again(

@@ -1,32 +1,17 @@
 """Tables: what they say of rows, the paper's numbers beside ours, and how they are written."""
 
-import csv as csv_module
-import io
 import math
 import re
-from html.parser import HTMLParser
+from typing import Any
 
 import numpy as np
 import pytest
 
 from training.evaluation import paper_numbers as paper
+from training.evaluation.document import Cell, Table, table_markdown
 from training.evaluation.evaluate import NO_OPS, Row
-from training.evaluation.statistics import BOOTSTRAP, interval
-from training.evaluation.tables import (
-    csv,
-    emphasised,
-    html,
-    markdown,
-    mean_of,
-    note_1,
-    note_2,
-    note_3,
-    report,
-    summary,
-    table_1,
-    table_2,
-    table_3,
-)
+from training.evaluation.statistics import BOOTSTRAP, interval, mean_and_interval
+from training.evaluation.tables import emphasised, mean_of, report, summary, table_1, table_2, table_3
 from training.evaluation.timing import Inference
 
 
@@ -44,41 +29,49 @@ def rows_of(pmd: dict[str, float]) -> list[Row]:
     ]
 
 
-def as_dicts(lines: list[list[str]]) -> list[dict[str, str]]:
-    return [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
+HERE: Any = {"here": "H", "emd_points": 615}
+
+
+def as_dicts(table: Table) -> list[dict[str, str]]:
+    heading, *lines = [[cell.text for cell in line] for line in table.cells]
+    return [dict(zip(heading, line, strict=True)) for line in lines]
+
+
+def bold(table: Table) -> set[str]:
+    return {cell.text for line in emphasised(table).cells for cell in line if cell.bold}
 
 
 COSTS = {
     "NPT": Inference(6_054_941, 23_661.2, 0.21, 0.2, 0.25, 615, 369, 20, 1, "cpu", 0.22),
     "DSFFNet": Inference(9_371_023, 36_616.0, 0.1, 0.09, 0.13, 615, 369, 20, 1, "cpu", 0.11),
-    "mine": Inference(1, 0.5, 0.001, 0.001, 0.002, 615, 369, 20, 1, "cpu"),
+    "mine": Inference(1, 0.5, 0.001, 0.001, 0.002, 615, 369, 20, 1, "cpu", 0.001),
 }
 
 
 def test_the_summary_means_what_it_says() -> None:
     rows = [row("DSFFNet", "seen", 0, 1e-4), row("DSFFNet", "seen", 1, 3e-4), row("target unchanged", "seen", 0, 5e-2)]
     assert mean_of(rows, method="DSFFNet", pose_type="seen", field="pmd") == pytest.approx(2e-4)
-    lines = summary(rows)
+    lines = summary(rows).lines
     assert lines[1] == ["seen", "DSFFNet", "2.00", "2.00", "1000.00", "200.00", "3.0", "0.040", "5.0"]
     assert [line[1] for line in lines[1:]] == ["DSFFNet", "target unchanged"]
     text = report(rows, title="T", about="A.", emd_points=64)
     assert "2 with seen poses" in text and "assignment (exact) of 64 vertices" in text
     assert re.search(r"PMD x1e-4 on seen poses, 95 % intervals .*: DSFFNet 1.00 to 3.00\.", text) and BOOTSTRAP in text
-    widths = {len(line) for line in markdown(lines).splitlines()}
+    widths = {len(line) for line in table_markdown(summary(rows)).splitlines()}
     assert len(widths) == 1, "columns line up"
 
 
 def test_a_method_that_diverged_stays_in_the_table() -> None:
     rows = [*rows_of({"NPT": 3}), row("DSFFNet", "unseen", 0, math.nan), row("DSFFNet", "unseen", 1, 1e-4)]
-    assert ["unseen", "DSFFNet", "nan", "nan"] in [line[:4] for line in summary(rows)]
-    found = as_dicts(table_1(rows))
+    assert ["unseen", "DSFFNet", "nan", "nan"] in [list(line[:4]) for line in summary(rows).lines]
+    found = as_dicts(table_1(rows, **HERE))
     assert [line["unseen PMD"] for line in found if line["numbers"] == "ours"] == ["5.00", "nan"]
-    assert "<strong>nan" not in html(table_1(rows))
+    assert "nan" not in bold(table_1(rows, **HERE))
 
 
 def test_table_1_shows_ours_and_below_it_theirs_in_the_papers_order() -> None:
     rows = rows_of({"DSFFNet": 1, "NPT": 5, "mine": 4, "target unchanged": 90, "3D-CoreNet": 3})
-    found = as_dicts(table_1(rows))
+    found = as_dicts(table_1(rows, **HERE))
     assert [(line["method"], line["numbers"]) for line in found] == [
         (name, numbers) for name in ("NPT", "3D-CoreNet", "DSFFNet") for numbers in ("ours", "paper, SMPL")
     ] + [("mine", "ours"), ("target unchanged", "no-op")]
@@ -86,14 +79,14 @@ def test_table_1_shows_ours_and_below_it_theirs_in_the_papers_order() -> None:
     theirs = found[5]
     assert list(theirs.values())[2:8] == ["0.57", "1.37", "13.40", "1.78", "2.18", "21.44"]
     assert theirs["minus DSFFNet's, 95 %"] == ""
-    animals = as_dicts(table_1(rows, data="SMAL"))[1]
+    animals = as_dicts(table_1(rows, data="SMAL", **HERE))[1]
     assert (animals["numbers"], animals["seen PMD"], animals["unseen EMD"]) == ("paper, SMAL", "50.67", "162.48")
 
 
 def test_spread_is_the_methods_own_interval_and_the_paired_difference() -> None:
     found = {
         line["method"]: line
-        for line in as_dicts(table_1(rows_of({"DSFFNet": 1, "NPT": 5})))
+        for line in as_dicts(table_1(rows_of({"DSFFNet": 1, "NPT": 5}), **HERE))
         if line["numbers"] == "ours"
     }
     low, high = (float(end) for end in found["NPT"]["unseen PMD, 95 %"].split(" to "))
@@ -101,22 +94,13 @@ def test_spread_is_the_methods_own_interval_and_the_paired_difference() -> None:
     # the same triples are hard for both, so the difference is known to the digit although the means are not
     assert found["NPT"]["minus DSFFNet's, 95 %"] == "+4.00 (+4.00 to +4.00)"
     assert found["DSFFNet"]["minus DSFFNet's, 95 %"] == ""
-    alone = as_dicts(table_1(rows_of({"NPT": 5, "mine": 2})))
+    alone = as_dicts(table_1(rows_of({"NPT": 5, "mine": 2}), **HERE))
     assert alone[-1]["minus NPT's, 95 %"] == "-3.00 (-3.00 to -3.00)", "without DSFFNet the first stands for it"
-
-
-def test_an_interval_holds_the_mean_of_what_is_drawn_nineteen_times_in_twenty() -> None:
-    random, hits = np.random.default_rng(1), 0
-    for _ in range(200):
-        low, high = interval(random.normal(3, 1, 50).tolist()) or (9, 9)
-        hits += low <= 3 <= high
-    assert 0.88 <= hits / 200 <= 0.99
-    assert interval([1.0]) is None and interval([2.0, 2.0]) == (2.0, 2.0)
 
 
 def test_tables_of_seen_poses_alone_have_their_spread_there() -> None:
     seen = [each for each in rows_of({"DSFFNet": 1, "NPT": 5}) if each.pose_type == "seen"]
-    line = as_dicts(table_1(seen))[0]
+    line = as_dicts(table_1(seen, **HERE))[0]
     assert line["unseen PMD"] == "-" and line["seen PMD, 95 %"]
 
 
@@ -126,26 +110,27 @@ def test_table_2_has_sizes_and_times_with_theirs_on_their_gpu() -> None:
     both = [(name, each) for name in ("NPT", "DSFFNet") for each in numbers]
     assert [(line["method"], line["numbers"]) for line in found] == [*both, ("mine", "ours")]
     assert [line["size KiB"] for line in found] == ["23,661", "23,668", "36,616", "36,631", "0"]
-    assert [line["mean s a pair"] for line in found] == ["0.2200", "0.0071", "0.1100", "0.0076", "-"]
+    assert [line["mean s a pair"] for line in found] == ["0.2200", "0.0071", "0.1100", "0.0076", "0.0010"]
     assert [line["median s"] for line in found] == ["0.2100", "", "0.1000", "", "0.0010"]
-    note = note_2(COSTS)
+    note = table_2(COSTS).notes
     assert "615 (source) and 369 (target)" in note and "on cpu with 1 thread;" in note and "RTX 3080" in note
 
 
 def test_table_3_compares_ablations_with_the_papers() -> None:
     rows = rows_of({"DSFFNet": 1, "w/o L_edge": 2, "DSFFNet w/o FFAdaIN": 4, "target unchanged": 90})
-    found = as_dicts(table_3(rows))
+    found = as_dicts(table_3(rows, **HERE))
     names = [line["method"] for line in found if line["numbers"] == "ours"]
     assert names == ["DSFFNet", "DSFFNet w/o FFAdaIN", "w/o L_edge"]
     assert [line["unseen PMD"] for line in found] == ["3.00", "1.78", "6.00", "10.72", "4.00", "2.12"]
     assert found[0]["unseen edge"] == "0.040" and found[1]["unseen edge"] == ""
 
 
-@pytest.mark.parametrize("note", [note_1(here="H", emd_points=615), note_3(here="H", emd_points=615)])
-def test_notes_say_units_points_and_that_the_data_differ(note: str) -> None:
+@pytest.mark.parametrize("table", [table_1, table_3])
+def test_notes_say_units_points_and_that_the_data_differ(table: Any) -> None:
+    note = table(rows_of({"DSFFNet": 1}), **HERE).notes
     for words in ("1e-4", "1e-3", "over 615 vertices", "Ours: H.", "other data", "6,890", "bootstrap", "budget differ"):
         assert words in note
-    assert "3,889" in note_1(data="SMAL", here="H", emd_points=615)
+    assert "3,889" in table_1(rows_of({"NPT": 1}), data="SMAL", **HERE).notes
 
 
 def test_the_papers_numbers_keep_the_bound_where_they_are_said_to_and_sizes_fit_the_parameters() -> None:
@@ -161,66 +146,32 @@ def test_the_papers_numbers_keep_the_bound_where_they_are_said_to_and_sizes_fit_
         assert cost.kilobytes == pytest.approx(parameters[name] * 4 / 1024, rel=2e-3)
 
 
-class Table(HTMLParser):
-    """Reads what the renderer wrote: rows of (tag, class, text, whether bold)."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.rows: list[list[tuple[str, str]]] = []
-        self.bold: list[str] = []
-        self.theirs, self.tags, self._open = 0, [], []
-        self.feed(text)
-        assert not self._open, "every element is closed"
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self._open.append(tag)
-        self.tags.append(tag)
-        self.theirs += dict(attrs).get("class") == "theirs"
-        if tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append((tag, ""))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self._open and self._open[-1] in ("td", "th", "strong"):
-            tag, before = self.rows[-1][-1]
-            self.rows[-1][-1] = (tag, before + data)
-            self.bold += [data] * (self._open[-1] == "strong")
+def test_the_interval_is_of_the_mean_narrows_with_more_values_and_is_the_same_each_time() -> None:
+    random, hits = np.random.default_rng(1), 0
+    for _ in range(200):
+        low, high = interval(random.normal(3, 1, 50).tolist()) or (9, 9)
+        hits += low <= 3 <= high
+    assert 0.88 <= hits / 200 <= 0.99, "nineteen times in twenty"
+    assert interval([1.0]) is None and interval([2.0, 2.0]) == (2.0, 2.0)
+    mean, low, high = mean_and_interval([1.0, 3.0] * 5)
+    assert mean == 2 and high - low == pytest.approx(2 * 1.96 / math.sqrt(10), rel=0.15), "the normal approximation"
+    assert mean_and_interval([4.0]) == (4.0, 4.0, 4.0) and math.isnan(mean_and_interval([])[0])
 
 
-def test_html_holds_every_cell_the_best_bold_and_theirs_apart() -> None:
-    lines = table_1(rows_of({"DSFFNet": 1, "NPT": 5, "target unchanged": 0}))
-    found = Table(html(lines, caption="Ours & <theirs>"))
-    assert [[text for _, text in line] for line in found.rows] == lines
-    assert {tag for tag, _ in found.rows[0]} == {"th"} and [line[0][0] for line in found.rows] == ["th"] * len(lines)
-    assert found.theirs == 2 and {"table", "caption", "thead", "tbody"} <= set(found.tags)
-    assert {"1.00", "3.00", "0.57", "21.44"} <= set(found.bold), "the best of ours, and of theirs"
-    assert not {"5.00", "2.39", "0.00", "2.00"} & set(found.bold), "no others, and no baseline that does nothing"
+def test_the_best_of_ours_and_of_theirs_of_seen_and_of_unseen_are_apart_and_no_op_is_one() -> None:
+    lines = table_1(rows_of({"DSFFNet": 1, "NPT": 5, "target unchanged": 0}), **HERE)
+    assert {"1.00", "3.00", "0.57", "21.44"} <= bold(lines) and not {"5.00", "2.39", "0.00", "2.00"} & bold(lines)
+    assert "200.00" not in bold(lines), "EMD of both: what is equal has no best"
+    both = bold(summary(rows_of({"DSFFNet": 1, "NPT": 5})))
+    assert {"1.00", "3.00"} <= both and not {"5.00", "7.00"} & both
 
 
-def test_best_of_seen_and_of_unseen_are_looked_for_apart() -> None:
-    bold = Table(html(summary(rows_of({"DSFFNet": 1, "NPT": 5})))).bold
-    assert {"1.00", "3.00"} <= set(bold) and not {"5.00", "7.00"} & set(bold)
-
-
-def test_what_is_equal_has_no_best_and_names_that_begin_with_digits_are_words() -> None:
-    text = html(table_1(rows_of({"3D-CoreNet": 1, "NPT": 5})))
-    assert '<th scope="col" class="words">method</th>' in text and '<th scope="col">seen PMD</th>' in text
-    assert "200.00" not in Table(text).bold, "EMD of both"
-
-
-def test_markdown_can_be_emphasised() -> None:
-    text = markdown(emphasised(table_1(rows_of({"DSFFNet": 1, "NPT": 5}))))
+def test_theirs_are_in_italics_in_markdown_that_lines_up() -> None:
+    table = emphasised(table_1(rows_of({"DSFFNet": 1, "NPT": 5}), **HERE))
+    assert Cell("0.57", bold=True, italic=True) in table.cells[-1]
+    text = table_markdown(table)
     assert "**1.00**" in text and "***0.57***" in text and "*2.39*" in text and " 5.00 " in text
     assert len({len(line) for line in text.splitlines()}) == 1
-
-
-def test_csv_gives_the_cells_back() -> None:
-    lines = table_2(COSTS)
-    assert list(csv_module.reader(io.StringIO(csv(lines)))) == lines
 
 
 def test_no_ops_are_those_of_the_evaluation() -> None:

@@ -15,7 +15,7 @@ from tests.support.recipes import mixed_dataset, tiny_training
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.inference.predict import network_from
 from training.recipes.training import EvaluationRecipe
-from training.reports.examples import comparisons_of, draw_comparisons, draw_examples, examples_of
+from training.reports.examples import comparisons_of, draw_comparisons, examples_of
 from training.viz.transfer_example import Comparison
 
 RECIPE = EvaluationRecipe(emd_points=8, examples=2)
@@ -99,6 +99,6 @@ def test_figure_viewer_and_meshes_of_every_method_are_written(dataset: str, tmp_
 
 def test_the_output_of_a_single_method_is_called_output(dataset: str, tmp_path: Path) -> None:
     opened = open_dataset(dataset)
-    draw_examples(examples_of(opened, Unchanged(), RECIPE, rows_of(opened, "mine", 0.1))[:1], tmp_path, title="legs")
+    draw_comparisons(examples_of(opened, Unchanged(), RECIPE, rows_of(opened, "mine", 0.1))[:1], tmp_path, title="legs")
     names = sorted(path.name for path in (tmp_path / "meshes").iterdir())
     assert names == [f"00-{role}.glb" for role in ("output", "source", "target", "truth")]

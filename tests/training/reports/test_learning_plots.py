@@ -14,7 +14,7 @@ from datagen.common.errors import CheckpointError
 from training.evaluation.evaluate import Row
 from training.reports.plots import ablation as ablation_module
 from training.reports.plots import convergence as convergence_module
-from training.reports.plots.ablation import ablation_figure, mean_interval
+from training.reports.plots.ablation import ablation_figure
 from training.reports.plots.convergence import convergence_figure, learning_of
 from training.viz.style import METHOD_COLORS
 
@@ -98,15 +98,6 @@ def rows_of(method: str, pmd: float, *, pose_types: tuple[str, ...] = ("seen", "
         for kind in pose_types
         for n in range(count)
     ]
-
-
-def test_the_interval_holds_the_mean_and_narrows_with_more_values() -> None:
-    few, many = ([1.0, 3.0] * count for count in (5, 500))
-    mean, low, high = mean_interval(few)
-    assert mean == pytest.approx(2.0) and low < mean < high
-    assert mean_interval(many)[2] - mean_interval(many)[1] < (high - low) / 5
-    assert high - low == pytest.approx(2 * 1.96 / np.sqrt(10), rel=0.15), "the normal approximation"
-    assert mean_interval([4.0]) == (4.0, 4.0, 4.0)
 
 
 def test_each_method_has_a_dot_its_value_and_its_ratio_to_the_full_network(drawn: list[Figure]) -> None:

@@ -12,8 +12,10 @@ from urllib.parse import unquote
 import pytest
 
 from datagen.common.errors import StorageError
-from training.reports.markup import inline_markdown, markup_html
+from training.evaluation.document import markdown as markdown_of
+from training.reports.markup import markup_html
 from training.reports.report import (
+    Cell,
     Code,
     Facts,
     Page,
@@ -22,7 +24,6 @@ from training.reports.report import (
     Section,
     Table,
     Text,
-    document_blocks,
     plain,
     with_best,
     write_report,
@@ -132,18 +133,19 @@ def test_markup_of_callers_is_bold_italic_code_links_lists_and_headings() -> Non
     text = "## Head\nOne **bold**, *it*, `a_b < c`\ngoes on.\n\n- first\n  goes on\n- [two](docs/x.md)\n\n1. three"
     assert markup_html(text).splitlines() == [
         "<h3>Head</h3>",
-        "<p>One <strong>bold</strong>, <em>it</em>, <code>a_b &lt; c</code> goes on.</p>",
-        '<ul><li>first goes on</li><li><a href="docs/x.md">two</a></li></ul>',
-        "<ol><li>three</li></ol>",
+        "<p>One <strong>bold</strong>, <em>it</em>, <code>a_b &lt; c</code>",
+        "goes on.</p>",
+        *("<ul>", "<li>first", "goes on</li>", '<li><a href="docs/x.md">two</a></li>', "</ul>"),
+        *("<ol>", "<li>three</li>", "</ol>"),
     ]
-    assert inline_markdown("a < b, `a < b` & **c**") == "a &lt; b, `a < b` &amp; **c**"
-    assert markup_html("5 * 3 * 2 and a_b_c, [x](javascript:y)") == "<p>5 * 3 * 2 and a_b_c, x</p>"
+    assert markdown_of("a < b, `a < b` & **c**") == "a &lt; b, `a < b` &amp; **c**"
+    assert markup_html("5 * 3 * 2 and a_b_c, [x](javascript:y)") == "<p>5 * 3 * 2 and a_b_c, [x](javascript:y)</p>"
 
 
 def test_columns_of_numbers_stand_at_the_right_and_marked_cells_are_bold(tmp_path: Path) -> None:
     lines = [
         ["method", "PMD", "time", "of both", "note", "none"],
-        ["ours", "**1,024.5**", "0.3 s", "2.39 / 10.61", "3 of 4", "-"],
+        ["ours", Cell("1,024.5", bold=True), "0.3 s", "2.39 / 10.61", "3 of 4", "-"],
         ["theirs", "--", "±12 %", "8.60 ± 0.1", "12", ""],
     ]
     table = Table(lines, "Main results")
@@ -156,13 +158,16 @@ def test_columns_of_numbers_stand_at_the_right_and_marked_cells_are_bold(tmp_pat
 
 
 def test_intervals_and_differences_are_numbers_and_a_papers_own_stand_in_italics(tmp_path: Path) -> None:
-    lines = [["method", "PMD", "95 %"], ["ours", "1.20", "1.1 to 1.3"], ["*ours*", "*.57*", "+3.4 (+1.2 to +5.6)"]]
+    lines = [
+        ["method", "PMD", "95 %"],
+        ["ours", "1.20", "1.1 to 1.3"],
+        [Cell("ours", italic=True), Cell(".57", italic=True), "+3.4 (+1.2 to +5.6)"],
+    ]
     table = Table(with_best(lines, columns=[1]))
-    assert table.numeric == [False, True, True] and table.lines[2][1] == "***.57***"
+    assert table.numeric == [False, True, True] and table.cells[2][1] == Cell(".57", bold=True, italic=True)
     reader, markdown = written(tmp_path, table)
     assert "<strong><em>.57</em></strong>" in (tmp_path / "report.html").read_text()
     assert "***.57***" in markdown and len(reader.all("em")) == 2
-    assert Table([["a"], ["*"], ["2 * 3"], ["** **"]]).numeric == [False]
 
 
 def test_an_interval_stands_below_its_number_and_words_in_brackets_stay_in_their_line(tmp_path: Path) -> None:
@@ -182,28 +187,20 @@ def test_the_best_of_each_group_are_marked_ties_too() -> None:
         ["seen", "a", "2.0", "1"],
         ["seen", "b", "1,000.0", "7"],
         ["unseen", "a", "3.0", "-"],
-        ["unseen", "b", "**3.0**", "nothing"],
+        ["unseen", "b", "3.0", "nothing"],
+        ["unseen", "c", "nan", "nothing"],
+        ["unseen", "d", "4.0", "4"],
+        ["other", "a", "1.0", "4"],
         ["other", "b", "1.0", "4"],
     ]
     lowest = with_best(lines, columns=[2], group=0)
-    assert [line[2] for line in lowest[1:]] == ["**2.0**", "1,000.0", "**3.0**", "**3.0**", "1.0"]
-    assert [line[3] for line in with_best(lines, columns=[3], highest=True)[1:]] == ["1", "**7**", "-", "nothing", "4"]
+    assert [line[2].bold for line in lowest[1:]] == [True, False, True, True, False, False, False, False]
+    assert [line[3].text for line in with_best(lines, columns=[3], highest=True) if line[3].bold] == ["7"]
+    some = with_best(lines, columns=[2], group=lambda line: None if line[0] == Cell("seen") else "all")
+    assert [line[1].text for line in some if line[2].bold] == ["a", "b"], (
+        "seen takes no part; the ones of other are least"
+    )
     assert lines[1][2] == "2.0", "what was given stays"
-
-
-def test_a_document_of_ours_becomes_blocks_and_comes_out_as_it_was(tmp_path: Path) -> None:
-    document = (
-        "# Title\n\nAbout **this**.\n\n| a | b |\n|---|--:|\n| x \\| y | **1** |\n\n- one\n\n| c |\n|---|\n| 2 |\n"
-    )
-    blocks = document_blocks(document)
-    assert blocks == (
-        Text("About **this**."),
-        Table([["a", "b"], ["x | y", "**1**"]]),
-        Text("- one"),
-        Table([["c"], ["2"]]),
-    )
-    _, markdown = written(tmp_path, *blocks)
-    assert document_blocks(markdown)[1] == blocks[1]
 
 
 def test_contents_list_every_section_and_no_two_share_a_place(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from training.reports.report import (
     ReportError,
     Table,
     report_is_current,
-    report_of_sweep,
     what_was_run,
     workflow_report,
 )
@@ -139,17 +138,7 @@ def test_what_is_missing_is_named(out: Path, tmp_path: Path) -> None:
     (out / "run/evaluation/rows.csv").unlink()
     with pytest.raises(ReportError, match=r"no run/evaluation/rows\.csv"):
         workflow_report(out)
-    with pytest.raises(ReportError, match=r"no sweep\.md"):
-        report_of_sweep(out)
     assert not any((out / name).exists() for name in NAMES)
-
-
-def test_a_sweep_has_its_table_and_its_stages(out: Path) -> None:
-    (out / "sweep.md").write_text(
-        "# Sweep\n\nTwo trainings.\n\n| trial | end |\n|---|--:|\n| a | 1.5 |\n\nBest: **a**.\n"
-    )
-    html, markdown = (path.read_text() for path in report_of_sweep(out))
-    assert "| a     | 1.5 |" in markdown and "Two trainings." in html and "Dataset card" in html
 
 
 def test_times_are_told_as_people_say_them() -> None:

@@ -7,8 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from training.evaluation.run_curves import RunCurve, run_curve
 from training.reports.plots import sweep as sweep_figures
-from training.reports.plots.sweep import RunCurve, run_curve, spread, sweep_figure
+from training.reports.plots.sweep import spread, sweep_figure
 
 UNSEEN = "evaluation/pmd_unseen"
 

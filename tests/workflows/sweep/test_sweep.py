@@ -255,6 +255,9 @@ def test_the_report_is_sorted_names_the_best_and_gives_its_recipe(three: Sweep, 
     text = (swept / "sweep.md").read_text()
     assert text.index("| good") < text.index("| slow") < text.index("| wild")
     assert "Best: **good**" in text and "**wild** failed: loss or gradient is not finite" in text
+    html, markdown = ((swept / name).read_text() for name in ("report.html", "report.md"))
+    assert next(line for line in text.splitlines() if line.startswith("| good")) in markdown
+    assert "3 trainings from recipe" in html and "Dataset card" in html
     assert (swept / "figures" / "sweep.png").stat().st_size > 10_000
     assert load_recipe(str(swept / "best.yaml")).training == three.trials[2].recipe.training
     assert named(plan_sweep(recipe=None, shared=[], trials=str(swept / "trials.yaml"))) == ["slow", "wild", "good"]

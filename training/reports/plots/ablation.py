@@ -12,23 +12,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from training.evaluation.evaluate import POSE_TYPES, Row
+from training.evaluation.statistics import mean_and_interval
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
 
 _METRICS = (("PMD (1e-4)", "pmd", 1e4), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
-_DRAWS, _SEED = 2000, 0
 _OFFSETS = {"seen": 0.17, "unseen": -0.17}
 _AXES, _ROW, _TOP, _BOTTOM, _LETTER = 2.55, 0.5, 0.66, 0.34, 0.072  # inches
-
-
-def mean_interval(values: Sequence[float], *, draws: int = _DRAWS, seed: int = _SEED) -> tuple[float, float, float]:
-    """Return the mean of values [n] and the ends of its 95 % interval, by the percentile bootstrap over triples.
-
-    It says how sure the mean is for other triples, not for another training of the same network.
-    """
-    found = np.asarray(values, float)
-    chosen = np.random.default_rng(seed).integers(0, len(found), (draws, len(found)))
-    low, high = np.percentile(found[chosen].mean(1), (2.5, 97.5))
-    return float(found.mean()), float(low), float(high)
 
 
 def ablation_figure(
@@ -86,7 +75,7 @@ def _intervals(rows: Sequence[Row], methods: Sequence[str], field: str, factor: 
         if values and not (np.isfinite(values).all() and np.mean(values) > 0):
             raise ValueError(f"{field} of {method} on {pose_type} poses must be finite and positive: {np.mean(values)}")
         if values:
-            found[method] = mean_interval(values)
+            found[method] = mean_and_interval(values)
     return found
 
 

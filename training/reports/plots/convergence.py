@@ -14,8 +14,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
+from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
 from training.recipes.files import recipe_in
-from training.reports.plots.sweep import PMD_UNIT, RunCurve, run_curve, spread
+from training.reports.plots.sweep import spread
 from training.tracking.journal import read_journal
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
 
@@ -65,7 +66,7 @@ def learning_of(name: str, run: Path) -> Learning:
         )
     batch = recipe_in(resolve_within(run, "recipe.yaml")).batch
     loss, seen, unseen = (
-        _drawable(run_curve(rows, key, batch=batch, name=name))
+        run_curve(rows, key, batch=batch, name=name).drawable
         for key in ("loss/reconstruction", "evaluation/pmd_seen", "evaluation/pmd_unseen")
     )
     return Learning(name, replace(loss, pmd=loss.pmd / 3), seen, unseen)
@@ -107,11 +108,6 @@ def convergence_figure(
     for axes, over in zip(panels, ("steps", "seconds"), strict=True):  # the shared limits are known only now
         _name_ends(axes, learned, over)
     return saved(figure, path)
-
-
-def _drawable(curve: RunCurve) -> RunCurve:
-    shown = np.isfinite(curve.pmd) & (curve.pmd > 0)
-    return replace(curve, steps=curve.steps[shown], seconds=curve.seconds[shown], pmd=curve.pmd[shown])
 
 
 def _page(letters: int, title: str) -> tuple[Figure, list[Axes]]:

@@ -55,9 +55,9 @@ def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturb
     for name, color in method_colors(methods_in(rows)).items():
         levels = curve(rows, name, disturbance.name)
         at = [_place(disturbance, level.amount) for level in levels]
-        mean, half = (np.array([getattr(level, key) for level in levels]) * 1e4 for key in ("mean", "interval"))
+        mean, low, high = (np.array([getattr(level, key) for level in levels]) * 1e4 for key in ("mean", "low", "high"))
         axes.plot(at, mean, color=color, linewidth=1.6, marker="o", markersize=2.6, label=name)
-        axes.fill_between(at, np.maximum(mean - half, mean / 10), mean + half, color=color, alpha=0.18, linewidth=0)
+        axes.fill_between(at, low, high, color=color, alpha=0.18, linewidth=0)
     if np.isfinite(no_op(rows)):
         axes.axhline(no_op(rows) * 1e4, color=QUIET, linewidth=0.9, linestyle=(0, (5, 3)), label="target unchanged")
     axes.set_title(disturbance.heading, fontsize=8, color=INK, loc="left", weight="bold", pad=4)

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,76 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from datagen.common.arrays import Floats
+from training.evaluation.run_curves import PMD_UNIT, RunCurve
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, saved
 
-PMD_UNIT = 1e-4
-"""Unit of PMD in tables and figures (paper, Table 1)."""
 _BEST = "#d1462f"
 _OTHERS = ("#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")
 _REST = "#aab2be"
 _LEFT, _AXES, _GAP, _LETTER = 0.7, 5.0, 0.3, 0.063  # inches: before the axes, the axes, to the names, a letter of them
 _LABEL_POINTS = 10.5  # height of a line of labels
 _LONGEST_NAME = 60
-
-
-@dataclass(frozen=True)
-class RunCurve:
-    """A run's metric at each of its evaluations.
-
-    Parameters
-    ----------
-    name : str
-        What to call the run.
-    steps, seconds : float arrays [n]
-        Steps, and seconds of training until then (evaluations included, pauses between commands not).
-    pmd : float array [n]
-        Point-wise mesh distance in normalised coordinates (:func:`training.objectives.metrics.point_mesh_distance`),
-        not yet in units of 1e-4.
-    finished : bool
-        Whether it came to its end; one that did not is never the best.
-    """
-
-    name: str
-    steps: Floats
-    seconds: Floats
-    pmd: Floats
-    finished: bool = True
-
-    def __len__(self) -> int:
-        return len(self.pmd)
-
-    @property
-    def final(self) -> float:
-        """The last measured value, infinity where none was."""
-        return float(self.pmd[-1]) if len(self) else float("inf")
-
-    def first_reached(self, level: float) -> tuple[float, float] | None:
-        """Step and seconds of the first evaluation at or below ``level``, None where there was none."""
-        places = np.flatnonzero(self.pmd <= level)
-        return (float(self.steps[places[0]]), float(self.seconds[places[0]])) if len(places) else None
-
-
-def run_curve(
-    rows: Sequence[Mapping[str, float]], key: str, *, batch: int, name: str = "", finished: bool = True
-) -> RunCurve:
-    """One metric of a journal over steps and seconds.
-
-    Seconds are counted by the journal's own throughput, ``batch * steps / meshes_per_second`` of each line, so that
-    time between two commands of a resumed run does not count.
-
-    Parameters
-    ----------
-    rows : lines of a journal
-    key : metric, for example ``evaluation/pmd_unseen``; lines without it, or where it is not finite, give no point
-    batch : triples in a step
-    name, finished : see :class:`RunCurve`
-    """
-    before = np.array([0, *(row["step"] for row in rows)], float)
-    rates = np.array([row.get("meshes_per_second", np.nan) for row in rows], float)
-    clock = np.nancumsum(np.diff(before) * batch / rates)
-    measured = [place for place, row in enumerate(rows) if np.isfinite(row.get(key, np.nan))]
-    values = np.array([rows[place][key] for place in measured], float)
-    return RunCurve(name, before[1:][measured], clock[measured], values, finished)
 
 
 def sweep_figure(
@@ -105,7 +43,8 @@ def sweep_figure(
     levels : dict, optional
         Name -> PMD, drawn as dashed lines unless all values lie below.
     """
-    drawn = sorted(filter(len, map(_positive, curves)), key=lambda curve: (not curve.finished, curve.final))
+    drawable = [curve.drawable for curve in curves if len(curve.drawable)]
+    drawn = sorted(drawable, key=lambda curve: (not curve.finished, curve.final))
     if not drawn:
         raise ValueError("no run has a PMD to draw")
     figure, axes = _page(len(drawn), max(len(_label(curve)) for curve in drawn), title)
@@ -127,11 +66,6 @@ def _page(count: int, letters: int, title: str) -> tuple[Figure, Sequence[Axes]]
     figure.subplots_adjust(**sides, top=1 - 0.42 / height, bottom=0.5 / height, hspace=0.55 / panel)
     figure.text(_LEFT / width, 1 - 0.2 / height, title, fontsize=9, weight="bold", color=INK, parse_math=False)
     return figure, list(axes)
-
-
-def _positive(curve: RunCurve) -> RunCurve:
-    shown = np.isfinite(curve.pmd) & (curve.pmd > 0)
-    return replace(curve, steps=curve.steps[shown], seconds=curve.seconds[shown], pmd=curve.pmd[shown])
 
 
 def _color(rank: int) -> str:
