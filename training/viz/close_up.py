@@ -8,8 +8,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh
 from training.viz.render.camera import Camera
-from training.viz.transfer_example import Solid
 
 _REACH, _AROUND = 0.17, 0.1  # of the longest edge of the truth's box: half a close-up's height, and what is averaged
 _SHAPE = 4 / 3  # width by height
@@ -25,7 +25,7 @@ class CloseUp:
     reach: float
 
     @classmethod
-    def of(cls, truth: Solid, outputs: Sequence[Solid]) -> "CloseUp":
+    def of(cls, truth: Mesh, outputs: Sequence[Mesh]) -> "CloseUp":
         """Where the errors of the worst and the best output differ most, on average over the surroundings.
 
         Its centre is the middle of what the truth and all outputs have there. Places that an output has moved out of

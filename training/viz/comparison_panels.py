@@ -7,11 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh
 from training.viz.close_up import CloseUp, close_up_size, outlined
 from training.viz.render.camera import Camera
 from training.viz.render.renderer import render_mesh
 from training.viz.style import PAGE, ROLE_COLORS, error_colors
-from training.viz.transfer_example import Comparison, Solid, camera_of, in_view, output_of
+from training.viz.transfer_example import Comparison, camera_of, in_view, output_of
 
 SIDE = 20  # pixels of margin
 _AIR = 8  # pixels left free above and below what a strip shows
@@ -71,7 +72,7 @@ class ShownRow:
     """A comparison, its placed meshes, and each method's errors [v] in the unit of the colour bar."""
 
     comparison: Comparison
-    meshes: Mapping[str, Solid]
+    meshes: Mapping[str, Mesh]
     errors: Mapping[str, Floats]
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.colors import to_rgb
 
 from datagen.common.arrays import Floats, Integers
 from datagen.mesh.geometry import Mesh
@@ -16,7 +17,7 @@ from training.viz.page import Page
 from training.viz.render.camera import frame
 from training.viz.render.renderer import Camera, MeshLike, render_mesh
 from training.viz.style import PAGE, QUIET, ROLE_COLORS, saved
-from training.viz.transfer_example import Solid, standing_point
+from training.viz.transfer_example import standing_point
 
 __all__ = ["ROLE_COLORS", "contact_sheet"]
 
@@ -47,25 +48,21 @@ def contact_sheet(
     """
     if not len(grid) == len(faces_per_row) == len(row_labels) or any(len(row) != len(column_labels) for row in grid):
         raise ValueError("grid, faces_per_row, row_labels and column_labels differ in length")
-    standing = [[np.asarray(one, float) - standing_point(np.asarray(one, float)) for one in row] for row in grid]
+    stood = [[standing(np.asarray(one, float)) for one in row] for row in grid]
     camera = frame(
-        [Solid(one, faces) for row, faces in zip(standing, faces_per_row, strict=True) for one in row], size=panel
+        [Mesh(one, faces) for row, faces in zip(stood, faces_per_row, strict=True) for one in row], size=panel
     )
     page = Page(width=90 + len(column_labels) * panel[0], height=70 + len(grid) * panel[1] + 20)
     for column, label in enumerate(column_labels):
         page.text(70 + (column + 0.5) * panel[0], 40, label, size=7.5, anchor="center", weight="bold")
-    for index, (row, faces) in enumerate(zip(standing, faces_per_row, strict=True)):
+    for index, (row, faces) in enumerate(zip(stood, faces_per_row, strict=True)):
         top = 70 + index * panel[1]
         page.text(38, top + panel[1] / 2, row_labels[index], size=7.5, anchor="center", rotation=90, weight="bold")
-        hue = _hex(_SHEET_HUES[index % len(_SHEET_HUES)])
+        hue = to_rgb(_SHEET_HUES[index % len(_SHEET_HUES)])
         for column, vertices in enumerate(row):
             picture = render_mesh(vertices, faces, colors=hue, camera=camera, size=panel, background=PAGE)
             page.picture(picture, 70 + column * panel[0], top)
     return saved(page.figure, path)
-
-
-def _hex(color: str) -> tuple[float, ...]:
-    return tuple(int(color[start : start + 2], 16) / 255 for start in (1, 3, 5))
 
 
 _LABELS, _HEADINGS, _LINE, _CAPTION, _EDGE = 156, 56, 30, 26, 16  # pixels
@@ -137,9 +134,7 @@ def mesh_grid(
 
 def standing(vertices: Floats, anchor: Floats | None = None) -> Floats:
     """Vertices [v, 3] moved so that ``anchor`` (by default they themselves) stands on the ground at the origin."""
-    anchor = vertices if anchor is None else anchor
-    low, high = anchor.min(0), anchor.max(0)
-    return np.asarray(vertices - [(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2], np.float64)
+    return np.asarray(vertices - standing_point(vertices if anchor is None else anchor), np.float64)
 
 
 def drawable(mesh: MeshLike) -> Mesh:

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from datagen.common.arrays import Floats, Integers
+from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh
 from training.viz.render.camera import Camera, MeshLike, azimuth_of, frame
 
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
@@ -41,14 +42,6 @@ class Comparison:
         given = {"source": self.source, "target": self.target}
         outputs = {output_of(name): mesh for name, mesh in self.outputs.items()}
         return {**given, **outputs, **({} if self.truth is None else {"truth": self.truth})}
-
-
-@dataclass(frozen=True)
-class Solid:
-    """Vertices [v, 3] and triangles [f, 3]."""
-
-    vertices: Floats
-    faces: Integers
 
 
 @dataclass(frozen=True)
@@ -118,7 +111,7 @@ def best_of(errors: Mapping[str, Floats]) -> str | None:
     return min(errors, key=lambda name: float(np.square(errors[name]).mean())) if len(errors) > 1 else None
 
 
-def placed(comparison: Comparison) -> dict[str, Solid]:
+def placed(comparison: Comparison) -> dict[str, Mesh]:
     """Return all meshes, named as in :meth:`Comparison.meshes`, set down on the ground at the origin.
 
     Outputs are moved together with the truth, so that an offset between them is seen. The source only shows a pose:
@@ -129,20 +122,18 @@ def placed(comparison: Comparison) -> dict[str, Solid]:
     ValueError
         If a vertex is not finite.
     """
-    meshes = {
-        name: Solid(np.asarray(m.vertices, float), np.asarray(m.faces)) for name, m in comparison.meshes().items()
-    }
+    meshes = {name: Mesh(np.asarray(m.vertices, float), np.asarray(m.faces)) for name, m in comparison.meshes().items()}
     for name, mesh in meshes.items():
         if bad := int((~np.isfinite(mesh.vertices).all(1)).sum()):
             raise ValueError(f"{comparison.title}: {bad} of {len(mesh.vertices)} vertices of the {name} are not finite")
     right = meshes.get("truth") or next((m for name, m in meshes.items() if name.startswith("output ")), None)
     return {
-        name: Solid(_stood(mesh, name, right, moves_with=meshes.get("truth")), mesh.faces)
+        name: Mesh(_stood(mesh, name, right, moves_with=meshes.get("truth")), mesh.faces)
         for name, mesh in meshes.items()
     }
 
 
-def _stood(mesh: Solid, name: str, right: Solid | None, *, moves_with: Solid | None) -> Floats:
+def _stood(mesh: Mesh, name: str, right: Mesh | None, *, moves_with: Mesh | None) -> Floats:
     anchor = moves_with if moves_with is not None and name.startswith("output ") else mesh
     scale = 1.0
     if name == "source" and right is not None:
@@ -160,7 +151,7 @@ def _size(vertices: Floats) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def camera_of(meshes: Mapping[str, Solid], size: tuple[int, int] = (320, 400)) -> Camera:
+def camera_of(meshes: Mapping[str, Mesh], size: tuple[int, int] = (320, 400)) -> Camera:
     """Return the camera that holds the placed meshes of a comparison in a panel of `size` pixels.
 
     The side it looks from suits source, target and truth, whatever the outputs look like.
@@ -169,14 +160,14 @@ def camera_of(meshes: Mapping[str, Solid], size: tuple[int, int] = (320, 400)) -
     return frame(_to_hold(meshes), size=size, azimuth=azimuth_of(known), margin=0.055)
 
 
-def in_view(meshes: Mapping[str, Solid]) -> tuple[Floats, Floats, Floats]:
+def in_view(meshes: Mapping[str, Mesh]) -> tuple[Floats, Floats, Floats]:
     """Return the axes [3, 3] of that camera as rows, and the least and largest coordinates [3] along them."""
     axes = camera_of(meshes).axes()
     points = np.concatenate([mesh.vertices for mesh in _to_hold(meshes)]) @ axes.T
     return axes, points.min(0), points.max(0)
 
 
-def _to_hold(meshes: Mapping[str, Solid]) -> list[Solid]:
+def _to_hold(meshes: Mapping[str, Mesh]) -> list[Mesh]:
     """Return what a picture must hold: an output that strays far from the truth does not shrink all the others."""
     known = [mesh for name, mesh in meshes.items() if not name.startswith("output ")]
     if "truth" not in meshes:
@@ -185,4 +176,4 @@ def _to_hold(meshes: Mapping[str, Solid]) -> list[Solid]:
     low, high = points.min(0), points.max(0)
     reach = _REACH * (high - low)
     outputs = [mesh for name, mesh in meshes.items() if name.startswith("output ")]
-    return known + [Solid(np.clip(mesh.vertices, low - reach, high + reach), mesh.faces) for mesh in outputs]
+    return known + [Mesh(np.clip(mesh.vertices, low - reach, high + reach), mesh.faces) for mesh in outputs]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.common.arrays import Floats, Integers
+from datagen.mesh.geometry import Mesh
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_example import Comparison
 from training.viz.viewer import write_viewer
@@ -13,11 +13,9 @@ PANEL = (480, 560)
 
 
 @dataclass(frozen=True)
-class NamedMesh:
-    """Vertices [v, 3], Y up and facing +Z, triangles [f, 3], and what the page calls them."""
+class NamedMesh(Mesh):
+    """A mesh, Y up and facing +Z, and what the page calls it."""
 
-    vertices: Floats
-    faces: Integers
     name: str
 
 

@@ -24,9 +24,10 @@ import numpy.typing as npt
 from datagen.common.arrays import Floats, Integers
 from datagen.common.files import write_atomically
 from datagen.common.printable import printable
+from datagen.mesh.geometry import Mesh
 from training.viz.render.lighting import ground_shadow, openness
 from training.viz.style import ERROR_COLORS, ROLE_COLORS, method_colors
-from training.viz.transfer_example import Comparison, ErrorScale, Solid, best_of, in_view, methods_in, output_of, placed
+from training.viz.transfer_example import Comparison, ErrorScale, best_of, in_view, methods_in, output_of, placed
 
 _LEVELS = 65535
 _GROUND_EVERY = 2  # the page keeps every second cell of the ground's shadow
@@ -133,7 +134,7 @@ def _errors(errors: Floats, unit: str) -> dict[str, Any]:
     }
 
 
-def _mesh(mesh: Solid, name: str, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
+def _mesh(mesh: Mesh, name: str, triangles: dict[str, dict[str, str]]) -> dict[str, Any]:
     vertices, faces = mesh.vertices, np.asarray(mesh.faces, np.int64)
     low = vertices.min(0)
     step = np.maximum(np.ptp(vertices, axis=0), 1e-12) / _LEVELS
@@ -162,7 +163,7 @@ def _shared_faces(faces: Integers, vertex_count: int, triangles: dict[str, dict[
     return key
 
 
-def _view(meshes: dict[str, Solid]) -> dict[str, Any]:
+def _view(meshes: dict[str, Mesh]) -> dict[str, Any]:
     """Return an example's first view, that of the pictures: its direction, and the extent to hold."""
     axes, low, high = in_view(meshes)
     extent = high - low

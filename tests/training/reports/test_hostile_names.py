@@ -11,19 +11,18 @@ import re
 import shlex
 import shutil
 import warnings
-from dataclasses import dataclass, replace
-from html.parser import HTMLParser
+from dataclasses import replace
 from pathlib import Path
 
 import mlflow
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError
 from datagen.common.printable import printable, printable_lines
 from datagen.store import open_dataset
+from tests.support.pages import Elements
 from tests.support.recipes import tiny_training
 from tests.support.workflows import finished_workflow, rows_on
 from training.evaluation.document import Table, Text, document_markdown, plain, table_markdown
@@ -46,6 +45,7 @@ from training.tracking.mlflow_mirror import publish
 from training.tracking.record import EXPERIMENT, Server, begin_record, end_record, read_record, update_record
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_example import Comparison
+from training.viz.transfer_picture import NamedMesh
 from training.viz.viewer import write_viewer
 from workflows.pipeline.console import guarded, print_facts
 from workflows.sweep.plan import plan_sweep
@@ -61,36 +61,6 @@ ALL = " ".join(HOSTILE)
 UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 1.0]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-
-
-@dataclass
-class Named:
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    name: str
-
-
-class Elements(HTMLParser):
-    """Elements of a page, and the text that is read outside scripts and styles."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.handlers: list[str] = []
-        self.text = ""
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.handlers += [
-            name
-            for name, value in attributes
-            if name.startswith("on") or (name in ("href", "src") and "script:" in (value or ""))
-        ]
-
-    def handle_data(self, data: str) -> None:
-        if self.tags[-1:] not in (["script"], ["style"]):
-            self.text += data
 
 
 def assert_inert_page(page: str, *, like: str) -> Elements:
@@ -110,7 +80,7 @@ def assert_inert_markdown(text: str, *, own_links: str = "a^") -> None:
 
 
 def comparison(method: str, title: str, name: str) -> Comparison:
-    mesh = Named(CORNERS, FACES, name)
+    mesh = NamedMesh(CORNERS, FACES, name)
     return Comparison(title, mesh, mesh, {method: mesh, "other": mesh}, mesh, {method: title})
 
 

@@ -5,13 +5,13 @@ import hashlib
 import re
 import struct
 import zlib
-from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
 
 from datagen.common.errors import StorageError
+from tests.support.pages import Elements
 from training.evaluation.document import markdown as markdown_of
 from training.reports.markup import markup_html
 from training.reports.report import (
@@ -30,35 +30,10 @@ from training.reports.report import (
 )
 
 HOSTILE = "</script><img src=x onerror=alert(1)> | `*_[a](javascript:b) ${title} &amp; <!-- \u2028 '\""
-VOID = {"meta", "img", "br", "link", "hr", "input"}
 
 
-class Reader(HTMLParser):
-    """What a browser would meet: elements, whether each is closed, and the text that is read."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs)))
-        self.open += [] if tag in VOID else [tag]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += "" if self.open and self.open[-1] in ("style", "script") else data
-
-    def all(self, tag: str) -> list[dict[str, str | None]]:
-        return [attributes for name, attributes in self.elements if name == tag]
-
-
-def read(path: Path) -> Reader:
-    reader = Reader()
-    reader.feed(path.read_text(encoding="utf-8"))
+def read(path: Path) -> Elements:
+    reader = Elements(path.read_text(encoding="utf-8"))
     assert not reader.open, f"never closed: {reader.open}"
     return reader
 
@@ -76,7 +51,7 @@ def png(path: Path, *, width: int = 3, height: int = 2) -> Path:
     return path
 
 
-def written(folder: Path, *blocks: object, title: str = "A title", lead: str = "A lead.") -> tuple[Reader, str]:
+def written(folder: Path, *blocks: object, title: str = "A title", lead: str = "A lead.") -> tuple[Elements, str]:
     html, markdown = write_report(folder, title=title, lead=lead, sections=[Section("Results", blocks)])  # type: ignore[arg-type]
     return read(html), markdown.read_text(encoding="utf-8")
 

@@ -2,16 +2,15 @@
 
 import subprocess
 import sys
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from datagen.mesh.geometry import Mesh
 from training.viz.render.renderer import (
     BACKGROUND,
     Camera,
     Floats,
-    Integers,
     frame,
     ground_shadow,
     openness,
@@ -22,24 +21,18 @@ from training.viz.render.renderer import (
 FRONT = Camera(eye=(0, 0, 10), target=(0, 0, 0), field_of_view=30)
 
 
-@dataclass
-class Solid:
-    vertices: Floats
-    faces: Integers
-
-
-def ellipsoid(radii: tuple[float, float, float] = (0.3, 1.0, 0.3), rings: int = 12, sides: int = 16) -> Solid:
+def ellipsoid(radii: tuple[float, float, float] = (0.3, 1.0, 0.3), rings: int = 12, sides: int = 16) -> Mesh:
     """Return a closed, outward-facing ellipsoid at the origin."""
     fall, turn = np.meshgrid(np.linspace(0, np.pi, rings), 2 * np.pi * np.arange(sides) / sides, indexing="ij")
     points = np.stack([np.sin(fall) * np.sin(turn), np.cos(fall), np.sin(fall) * np.cos(turn)], -1).reshape(-1, 3)
     index = np.arange(rings * sides).reshape(rings, sides)
     a, b, c, d = index[:-1], index[1:], np.roll(index, -1, 1)[1:], np.roll(index, -1, 1)[:-1]
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
-    return Solid(points * radii, faces)
+    return Mesh(points * radii, faces)
 
 
-def moved(mesh: Solid, *shift: float) -> Solid:
-    return Solid(mesh.vertices + np.array(shift), mesh.faces)
+def moved(mesh: Mesh, *shift: float) -> Mesh:
+    return Mesh(mesh.vertices + np.array(shift), mesh.faces)
 
 
 def covered(picture: np.ndarray) -> np.ndarray:
@@ -47,7 +40,7 @@ def covered(picture: np.ndarray) -> np.ndarray:
     return picture.max(-1) > 25
 
 
-def silhouette(mesh: Solid, camera: Camera | None = None, size: tuple[int, int] = (80, 100)) -> np.ndarray:
+def silhouette(mesh: Mesh, camera: Camera | None = None, size: tuple[int, int] = (80, 100)) -> np.ndarray:
     picture = render_mesh(mesh.vertices, mesh.faces, colors=(1, 1, 1), camera=camera, size=size, background=(0, 0, 0))
     return covered(picture)
 
@@ -60,7 +53,7 @@ def test_shape_type_and_background() -> None:
 
 
 def test_silhouette_of_a_square_is_where_projection_puts_it() -> None:
-    square = Solid(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    square = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     shown = silhouette(square, FRONT, (100, 100))
     half = 50 / np.tan(np.radians(15)) / 10  # pixels a unit at distance 10
     rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.evaluation.statistics import mean_and_interval
+from training.reports.plots.axes import logarithmic, style_axes
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
 
 _METRICS = (("PMD (1e-4)", "pmd", 1e4), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
@@ -122,19 +122,12 @@ def _styled(axes: Axes, count: int) -> None:
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     axes.set_xlim(low / 1.06, high * 1.06)
-    axes.xaxis.set_major_locator(LogLocator(subs=_places(high / low)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_locator(NullLocator())
+    logarithmic(axes.xaxis, _places(high / low))
     axes.set_ylim(count - 0.5, -0.5)
-    axes.tick_params(labelsize=7, colors=QUIET, which="both", width=0.5)
+    style_axes(axes, grid="x", sides=("bottom",))
     axes.tick_params(axis="y", length=0, labelleft=False)
-    axes.grid(True, axis="x", which="major", color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
     for row in range(1, count):
         axes.axhline(row - 0.5, color=RULE, linewidth=0.6, zorder=0)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side == "bottom")
-        spine.set_color("#b9c0c9")
 
 
 def _places(ratio: float) -> Sequence[float]:

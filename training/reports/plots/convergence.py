@@ -6,19 +6,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
 from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
 from training.recipes.files import recipe_in
-from training.reports.plots.sweep import spread
+from training.reports.plots.axes import EndLabel, dashed_level, label_ends, style_learning
 from training.tracking.journal import read_journal
-from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
+from training.viz.style import DPI, INK, PAGE, method_colors, saved
 
 _LEFT, _AXES, _HEIGHT, _TOP, _BOTTOM, _LETTER = 0.62, 3.7, 3.1, 0.52, 0.5, 0.068  # inches
 _LABEL_POINTS = 11.0
@@ -131,31 +129,10 @@ def _draw_panel(axes: Axes, learned: Sequence[Learning], over: str, baselines: M
             curve: RunCurve = getattr(one, kind)
             axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, color=colors[one.name], **style)
     for name, level in baselines.items():
-        axes.axhline(level / PMD_UNIT, color=QUIET, linewidth=0.8, linestyle=(0, (5, 3)), zorder=0)
-        axes.annotate(
-            name, (0.99, level / PMD_UNIT), xycoords=("axes fraction", "data"), xytext=(0, 2.5), ha="right",
-            textcoords="offset points", fontsize=6.5, color=QUIET, parse_math=False,
-        )  # fmt: skip
-    _styled(axes, learned)
+        dashed_level(axes, name, level / PMD_UNIT)
+    style_learning(axes)
     axes.set_xlabel("iteration" if over == "steps" else "seconds of training", fontsize=8, color=INK, labelpad=2)
     axes.set_ylabel("PMD (1e-4)" if over == "steps" else "", fontsize=8, color=INK, labelpad=2)
-
-
-def _styled(axes: Axes, learned: Sequence[Learning]) -> None:
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if high / low < 8 else (1, 2, 5)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-    axes.set_xlim(left=0)
-    axes.margins(x=0.01)
-    axes.tick_params(labelsize=7, colors=QUIET, which="both", width=0.5)
-    axes.grid(True, which="major", color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#b9c0c9")
 
 
 def _legend(figure: Figure, axes: Axes, learned: Sequence[Learning]) -> None:
@@ -174,18 +151,13 @@ def _label(one: Learning) -> str:
 
 
 def _name_ends(axes: Axes, learned: Sequence[Learning], over: str) -> None:
-    """Write value and name of each method beside the axes, at the height of its end but never over another."""
-    low, high = np.log(axes.get_ylim())
-    ranked = sorted(learned, key=lambda one: one.final.final)
-    ends = np.array([(np.log(one.final.final / PMD_UNIT) - low) / (high - low) for one in ranked])
-    colors = method_colors([one.name for one in learned])
-    for one, height in zip(ranked, spread(ends, _LABEL_POINTS / 72 / _HEIGHT), strict=True):
-        color, end = colors[one.name], (getattr(one.final, over)[-1], one.final.final / PMD_UNIT)
-        axes.annotate(
-            "", end, xycoords="data", xytext=(1.035, height), textcoords="axes fraction", annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.7, "linestyle": ":", "shrinkA": 0},
-        )  # fmt: skip
-        axes.text(
-            1.045, height, _label(one), transform=axes.transAxes, fontsize=7.5, va="center", color=color,
-            weight="bold" if one is ranked[0] else "normal", parse_math=False,
-        )  # fmt: skip
+    """Write value and name of each method beside the axes, the lowest in bold."""
+    ranked, colors = sorted(learned, key=lambda one: one.final.final), method_colors([one.name for one in learned])
+    labels = [
+        EndLabel(
+            _label(one), (getattr(one.final, over)[-1], one.final.final / PMD_UNIT), colors[one.name],
+            ink=colors[one.name], bold=not rank,
+        )
+        for rank, one in enumerate(ranked)
+    ]  # fmt: skip
+    label_ends(axes, labels, gap=_LABEL_POINTS / 72 / _HEIGHT, column=1.045, letters=7.5)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from datagen.mesh.geometry import Mesh, bounding_box
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, in_words, transfer_each
 from training.evaluation.robustness import Case, RobustnessRow, curve, disturbed, methods_in, no_op, refusal
+from training.reports.plots.axes import logarithmic, style_axes
 from training.viz.mesh_grid import Panel, Row, drawable, mesh_grid, standing
-from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, RULE, method_colors, saved, short
+from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, method_colors, saved, short
 
 _ABREAST = 5
 _BODY_METRES = 1.7
@@ -64,7 +64,9 @@ def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturb
     axes.set_xlabel(_unit(disturbance), fontsize=7, color=INK, labelpad=1)
     axes.set_xticks([_place(disturbance, amount) for amount in _ticks(disturbance)])
     axes.set_xticklabels([f"{amount:g}" for amount in _ticks(disturbance)])
-    _style(axes)
+    axes.set_yscale("log")
+    logarithmic(axes.yaxis, (1, 2, 5))
+    style_axes(axes, letters=6.5)
 
 
 def _place(disturbance: Disturbance, amount: float) -> float:
@@ -95,19 +97,6 @@ def _unit(disturbance: Disturbance) -> str:
 def millimetres(amount: float) -> float:
     """Half box edges as millimetres on a body that is 1.7 m along its longest box edge."""
     return 1000 * amount * _BODY_METRES / 2
-
-
-def _style(axes: Axes) -> None:
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.tick_params(labelsize=6.5, colors=QUIET, width=0.5)
-    axes.grid(True, color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#b9c0c9")
 
 
 def disturbance_picture(

@@ -5,14 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from datagen.common.arrays import Floats
 from training.evaluation.run_curves import PMD_UNIT, RunCurve
-from training.viz.style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.reports.plots.axes import EndLabel, dashed_level, label_ends, style_learning
+from training.viz.style import DPI, INK, PAGE, QUIET, saved
 
 _BEST = "#d1462f"
 _OTHERS = ("#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")
@@ -78,76 +76,24 @@ def _draw_panel(axes: Axes, curves: Sequence[RunCurve], over: str, levels: Mappi
         axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, marker="o", markersize=1.8 if rank else 3, **line)
     highest = max(curve.pmd.max() for curve in curves)
     for name, level in ((name, level) for name, level in levels.items() if level <= highest):
-        axes.axhline(level / PMD_UNIT, color=QUIET, linewidth=0.8, linestyle=(0, (5, 3)), zorder=0)
-        axes.annotate(
-            name, (0, level / PMD_UNIT), xycoords=("axes fraction", "data"), xytext=(3, 2.5),
-            textcoords="offset points", fontsize=6.5, color=QUIET, parse_math=False,
-            bbox={"facecolor": PAGE, "edgecolor": "none", "alpha": 0.75, "pad": 0.4},
-        )  # fmt: skip
-    _styled(axes)
-
-
-def _styled(axes: Axes) -> None:
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    places = range(1, 10) if high / low < 8 else (1, 2, 5) if high / low < 300 else (1,)
-    axes.yaxis.set_major_locator(LogLocator(subs=places))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
+        dashed_level(axes, name, level / PMD_UNIT, right=False)
+    style_learning(axes)
     axes.set_ylabel("PMD on unseen poses (1e-4)", fontsize=8, color=INK)
-    axes.set_xlim(left=0)
-    axes.margins(x=0.01)
-    axes.tick_params(labelsize=7, colors=QUIET, which="both", width=0.5)
-    axes.grid(True, which="major", color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#b9c0c9")
 
 
 def _name_lines(axes: Axes, curves: Sequence[RunCurve], over: str) -> None:
-    """Write names in a column beside the axes, at the heights of the lines' ends but never over each other."""
-    low, high = np.log(axes.get_ylim())
-    ranked = sorted(enumerate(curves), key=lambda one: one[1].final)
-    ends = np.array([(np.log(curve.final / PMD_UNIT) - low) / (high - low) for _, curve in ranked])
-    heights = spread(ends, _LABEL_POINTS / 72 / (axes.get_window_extent().height / DPI))
-    for (rank, curve), height in zip(ranked, heights, strict=True):
-        _name_line(axes, curve, rank, over, height)
-
-
-def _name_line(axes: Axes, curve: RunCurve, rank: int, over: str, height: float) -> None:
-    color, column = _color(rank), 1 + _GAP / _AXES
-    axes.annotate(
-        "", (getattr(curve, over)[-1], curve.final / PMD_UNIT), xycoords="data",
-        xytext=(column - 0.006, height), textcoords="axes fraction", annotation_clip=False,
-        arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "linestyle": ":", "shrinkA": 0},
-    )  # fmt: skip
-    style: dict[str, Any] = {"weight": "normal" if rank else "bold", "color": QUIET if color == _REST else color}
-    axes.text(
-        column, height, _label(curve), transform=axes.transAxes, fontsize=7, va="center", parse_math=False, **style
-    )
+    """Write names in a column beside the axes, in the order of the lines' ends."""
+    labels = [
+        EndLabel(
+            _label(curve), (getattr(curve, over)[-1], curve.final / PMD_UNIT), _color(rank),
+            ink=QUIET if _color(rank) == _REST else _color(rank), bold=not rank,
+        )
+        for rank, curve in sorted(enumerate(curves), key=lambda one: one[1].final)
+    ]  # fmt: skip
+    gap = _LABEL_POINTS / 72 / (axes.get_window_extent().height / DPI)
+    label_ends(axes, labels, gap=gap, column=1 + _GAP / _AXES, letters=7)
 
 
 def _label(curve: RunCurve) -> str:
     name = curve.name if len(curve.name) <= _LONGEST_NAME else f"{curve.name[: _LONGEST_NAME - 1]}…"
     return f"{curve.final / PMD_UNIT:.1f}  {name}{'' if curve.finished else ' (unfinished)'}"
-
-
-def spread(heights: Floats, gap: float) -> Floats:
-    """Heights [n] in 0..1, ascending, moved apart to at least ``gap`` with their order kept, as near as that allows.
-
-    Neighbours that would overlap are placed as one block about their common mean, again and again until none do.
-    """
-    blocks: list[tuple[float, int]] = []  # middle, members
-    for height in heights:
-        blocks.append((float(height), 1))
-        while len(blocks) > 1 and _overlap(blocks[-2], blocks[-1], gap):
-            (upper, more), (lower, fewer) = blocks.pop(), blocks.pop()
-            blocks.append(((upper * more + lower * fewer) / (more + fewer), more + fewer))
-    placed = [middle + gap * (place - (count - 1) / 2) for middle, count in blocks for place in range(count)]
-    found = np.array(placed)
-    return np.asarray(found - min(0.0, float(found[0])))
-
-
-def _overlap(lower: tuple[float, int], upper: tuple[float, int], gap: float) -> bool:
-    return upper[0] - lower[0] < gap * (lower[1] + upper[1]) / 2 - 1e-12

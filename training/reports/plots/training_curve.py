@@ -11,8 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from datagen.common.arrays import Floats
+from training.reports.plots.axes import apart, dashed_level, style_axes
 from training.tracking.journal import read_journal
-from training.viz.style import DPI, INK, PAGE, QUIET, RULE, saved
+from training.viz.style import DPI, INK, PAGE, saved
 
 
 def training_curve(
@@ -126,7 +127,7 @@ def _draw_block(axes: Axes, block: str, curves: Sequence[_Curve]) -> None:
 def _label_ends(axes: Axes, curves: Sequence[_Curve], *, gap: float) -> None:
     """Write each curve's name behind its end, moved where ends are close, with a hairline to the curve."""
     curves = sorted(curves, key=lambda curve: float(curve.values[-1]))
-    places = _apart([float(curve.values[-1]) for curve in curves], gap)
+    places = apart(np.array([curve.values[-1] for curve in curves]), gap)
     for curve, place in zip(curves, places, strict=True):
         last = float(curve.steps[-1])
         start = last + 0.06 * axes.get_xlim()[1]
@@ -135,16 +136,6 @@ def _label_ends(axes: Axes, curves: Sequence[_Curve], *, gap: float) -> None:
             curve.label, (start, place), xytext=(1.5, 0), textcoords="offset points",
             fontsize=7, va="center", color=curve.color, annotation_clip=False,
         )  # fmt: skip
-
-
-def _apart(places: Sequence[float], gap: float) -> list[float]:
-    """Return ascending places, at least ``gap`` apart, moved as little as need be."""
-    found = list(places)
-    for _ in range(100):
-        for above in range(1, len(found)):
-            lack = max(gap - (found[above] - found[above - 1]), 0.0)
-            found[above - 1], found[above] = found[above - 1] - lack / 2, found[above] + lack / 2
-    return found
 
 
 _TERM_COLORS = ("#1d2430", "#3f74c8", "#e08b3c", "#2f9e83", "#a868b8", "#c25b5b", "#8a8f3a", "#5aa9c9")
@@ -172,7 +163,7 @@ def _series(rows: Sequence[Mapping[str, float]], key: str) -> tuple[Floats, Floa
     return steps[values > 0], values[values > 0]
 
 
-def _smooth(values: Floats) -> Floats:
+def smooth(values: Floats) -> Floats:
     """Return a running geometric mean over about a fiftieth of the series, centred."""
     reach = max(len(values) // 50, 1)
     sums = np.cumsum(np.concatenate([[0.0], np.log(values)]))
@@ -183,14 +174,9 @@ def _smooth(values: Floats) -> Floats:
 
 def _styled(axes: Axes, label: str) -> None:
     axes.set_ylabel(label, fontsize=8, color=INK)
-    axes.tick_params(labelsize=7, colors=QUIET, which="both", width=0.5)
     axes.yaxis.get_offset_text().set_fontsize(6.5)
-    axes.grid(True, which="major", color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
     axes.margins(x=0.01)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#b9c0c9")
+    style_axes(axes)
 
 
 def _draw_terms(axes: Axes, rows: Sequence[Mapping[str, float]], keys: Sequence[str], *, dots: bool) -> None:
@@ -205,14 +191,10 @@ def _draw_terms(axes: Axes, rows: Sequence[Mapping[str, float]], keys: Sequence[
             axes.plot(steps, values, linewidth=1.6, marker="o", markersize=3, **style)
         else:
             axes.plot(steps, values, linewidth=0.5, alpha=0.28, color=style["color"])
-            axes.plot(steps, _smooth(values), linewidth=1.8, **style)
+            axes.plot(steps, smooth(values), linewidth=1.8, **style)
 
 
 def _draw_baselines(axes: Axes, baselines: Mapping[str, float]) -> None:
     for name, value in baselines.items():
         if np.isfinite(value) and value > 0:
-            axes.axhline(value, color=QUIET, linewidth=0.9, linestyle=(0, (5, 3)))
-            axes.annotate(
-                name, (1, value), xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points",
-                ha="right", fontsize=7, color=QUIET, parse_math=False,
-            )  # fmt: skip
+            dashed_level(axes, name, value)

@@ -3,12 +3,11 @@
 Frame: Y up, bodies face +Z. Supersampled, smooth-shaded, lit by a key light and an occluded sky, with a soft shadow.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from datagen.common.arrays import Floats, Integers
+from datagen.mesh.geometry import Mesh
 from training.viz.render.camera import Camera, MeshLike, checked_vertices, frame
 from training.viz.render.lighting import ground_shade, ground_shadow, lighting, openness, vertex_normals
 from training.viz.render.rasterizer import on_plane, planes, rasterise
@@ -75,7 +74,7 @@ def render_mesh(
     (40, 32, 3)
     """
     vertices, faces = checked_vertices(vertices), _checked_faces(faces, len(vertices))
-    camera = camera or frame([_Arrays(vertices, faces)], size=size)
+    camera = camera or frame([Mesh(vertices, faces)], size=size)
     normals = vertex_normals(vertices, faces)
     albedo = _linear(_checked_colors(CLAY if colors is None else colors, len(vertices)))
     light = _supersampled(camera, size, vertices, faces, np.c_[normals, openness(vertices, faces), albedo], shading)
@@ -83,12 +82,6 @@ def render_mesh(
     scenery = _linear(np.array(background)) * (1 - shading * ground_shade(camera, size, vertices, faces))[..., None]
     picture = _display(mesh_light + (1 - coverage) * scenery)
     return np.asarray(np.rint(255 * picture), np.uint8)
-
-
-@dataclass(frozen=True)
-class _Arrays:
-    vertices: Floats
-    faces: Integers
 
 
 def _checked_faces(faces: Integers, count: int) -> Integers:
