@@ -26,7 +26,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster test-slow fuzz lint bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
+.PHONY: help run test test-cluster test-slow fuzz lint docs bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -47,11 +47,17 @@ test-slow: $(READY) ## every rig and topology of Anny, the real animals (fetched
 fuzz: $(READY) ## damaged and hostile files of every kind that is read, 2,000 cases (ARGS="--cases 500 --minutes 5")
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-lint: $(READY) ## style, types, import rules
+lint: $(READY) ## style, types, import rules, Compose files, the documentation
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml $(wildcard deploy/*.yml)
+	@$(MAKE) --silent docs
+
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: $(READY) ## the documentation as a site, build/site/index.html; a broken link or an unknown name fails
+	@said=$$($(BIN)/mkdocs build --strict 2>&1) || { echo "$$said" >&2; exit 1; }
 
 bench: bench-generation bench-networks bench-input bench-training bench-transfer ## every benchmark for a CPU
 
