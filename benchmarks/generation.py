@@ -22,10 +22,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
-from datagen.bodies.skinning import joint_transforms
 from datagen.common.seeding import Stream, generator
 from datagen.generate import ensure_shard, generate, prepare
 from datagen.grid import Grid, Shard
+from datagen.mesh.rig import part_transforms
 from datagen.poses import draw_poses
 from datagen.recipe import DatasetRecipe
 from datagen.store.schema import shard_path
@@ -41,12 +41,12 @@ def recipe_of(topology: str, identities: int = IDENTITIES, poses: int = POSES) -
 
 def one_at_a_time(body: Any, parameters: np.ndarray, poses: Any, faces: np.ndarray, folder: Path) -> None:
     """Skin and write meshes singly, as NPT's data_generation.py does."""
-    rest = body._rest(parameters)
+    rest = body.rest(parameters)
     weights = rest.weights.toarray() if hasattr(rest.weights, "toarray") else rest.weights
     homogeneous = np.hstack([rest.vertices, np.ones((len(rest.vertices), 1))])
     world = body.world_rotations(poses)
     for number, rotations in enumerate(world):
-        transforms = joint_transforms(rest, rotations[None])[0]
+        transforms = part_transforms(rotations, rest.joints, rest.parents)
         blended = np.tensordot(weights, transforms, axes=[[1], [0]])
         vertices = np.matmul(blended, homogeneous[..., None])[..., 0]
         with open(folder / f"0_{number}.obj", "w") as file:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from datagen.common.assets import Asset
 from datagen.common.errors import BodyError
+from datagen.mesh.rig import Rig
 from datagen.poses import Poses, PoseSource
 from datagen.recipe import Body
 
@@ -37,6 +38,10 @@ class BodyModel(Protocol):
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] in metres, Y up, facing +Z."""
+        ...
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig | None:
+        """The identity's rig under poses of ``joints``; None for a family without a skeleton."""
         ...
 
 

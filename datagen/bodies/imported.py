@@ -19,6 +19,7 @@ from datagen.common.files import sha256_of
 from datagen.mesh.files import load_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.limits import BYTE_LIMIT
+from datagen.mesh.rig import Rig
 from datagen.poses import Poses
 from datagen.poses.pose_files import NUMBER
 from datagen.recipe import Axis, ImportedBody
@@ -81,6 +82,10 @@ class ImportedModel:
         for row, number in enumerate(poses.rotations[:, 0, 0]):
             vertices[row] = self._in_our_frame(self._read(self._meshes.path(identity, int(number)), first))
         return vertices
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig | None:
+        """None: files of posed meshes have no skeleton."""
+        return None
 
     def _read_first(self, identity: int) -> Mesh:
         path = self._meshes.first_path(identity)

@@ -7,8 +7,9 @@ family is added. Identity: length, thigh and ankle radius, knee height. It obeys
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies.skinning import Rest, skin
+from datagen.bodies.skinning import Rest, rig_of, skin
 from datagen.common.assets import Asset
+from datagen.mesh.rig import Rig, drivers_of
 from datagen.poses import JOINTS, Poses
 from datagen.recipe import LegBody
 
@@ -48,6 +49,11 @@ class LegModel:
         """Vertices [pose, vertex, 3] float32."""
         rest = self._rest(parameters)
         return skin(rest, poses.on(_BONES, rest.parents))
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """Thigh and shin; where they blend depends on the identity, so that each has weights of its own."""
+        rest = self._rest(parameters)
+        return rig_of(rest, _BONES, drivers_of(_BONES, rest.parents, joints))
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from datagen.bodies import BodyModel, load_body
 from datagen.common.assets import Asset
+from datagen.mesh.rig import Rig
 from datagen.poses import Poses
 from datagen.recipe import MixedBody
 
@@ -50,6 +51,11 @@ class MixedModel:
         """Vertices [pose, vertex, 3] of that identity's body."""
         body, own = self._of(parameters)
         return body.vertices(own, poses)
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig | None:
+        """The rig of that identity's body, None where it has none: bodies of one dataset may have different parts."""
+        body, own = self._of(parameters)
+        return body.rig(own, joints)
 
     def _of(self, parameters: NDArray[np.float64]) -> tuple[BodyModel, NDArray[np.float64]]:
         number = int(parameters[0])

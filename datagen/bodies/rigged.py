@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies.proportions import Scales, Stretchable
-from datagen.bodies.skinning import Rest, skin
+from datagen.bodies.skinning import Rest, rig_of, skin
 from datagen.characters.character import load_characters, shared_joints
 from datagen.characters.weld import volume
 from datagen.common.errors import BodyError
+from datagen.mesh.rig import Rig, drivers_of
 from datagen.poses import Poses
 from datagen.recipe import RiggedBody
 
@@ -55,6 +56,12 @@ class RiggedModel:
         """Vertices [pose, vertex, 3] float32; the root joint stays where it is at rest (no grounding)."""
         character = self._characters[int(parameters[0])]
         return skin(self._rest(parameters), poses.on(character.names, character.parents))
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """The joints of the identity's character; those that the poses do not turn are one part with their parents."""
+        character = self._characters[int(parameters[0])]
+        drivers = drivers_of(character.names, character.parents, joints)
+        return rig_of(self._rest(parameters), character.names, drivers)
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         number = int(parameters[0])

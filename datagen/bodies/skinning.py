@@ -15,6 +15,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from datagen.mesh.rig import Rig, part_transforms
+
 _POSES_AT_ONCE = 32  # bounds memory: 32 poses x 13,718 vertices x 3 coordinates x 8 bytes = 11 MB, about a CPU cache
 _COARSE, _FINE = 2.0**20, 2.0**24
 _EXACT_WITHIN = 4.0  # metres from the origin; a larger body's steps are larger by powers of two
@@ -28,24 +30,6 @@ class Rest:
     joints: NDArray[np.float64]
     weights: NDArray[np.float64] | scipy.sparse.csr_array
     parents: Sequence[int]
-
-
-def joint_transforms(rest: Rest, world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World transforms [pose, joint, 3, 4] that carry rest positions to posed ones.
-
-    ``world`` [pose, joint, 3, 3] are the joints' rotations relative to rest in world axes: the product of the
-    relative rotations of SMPL (Loper et al. 2015, equations 3 and 4) from the root on. Parents come before their
-    children; a root's parent is -1, and a root stays in its place.
-    """
-    posed = np.empty((len(world), len(rest.joints), 3))
-    for joint, parent in enumerate(rest.parents):
-        if parent < 0:
-            posed[:, joint] = rest.joints[joint]
-        else:
-            bone = rest.joints[joint] - rest.joints[parent]
-            posed[:, joint] = posed[:, parent] + world[:, parent] @ bone
-    offset = posed - (world @ rest.joints[..., None])[..., 0]
-    return np.concatenate([world, offset[..., None]], axis=-1)
 
 
 def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
@@ -69,11 +53,51 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     posed = np.empty((len(world), len(rest.vertices), 3), np.float32)
     for first in range(0, len(world), _POSES_AT_ONCE):
         some = slice(first, first + _POSES_AT_ONCE)
-        transforms = _round(joint_transforms(rest, world[some]), fine)
+        transforms = _round(part_transforms(world[some], rest.joints, rest.parents), fine)
         columns = np.ascontiguousarray(transforms.transpose(1, 3, 0, 2)).reshape(-1, 3 * len(transforms))
         vertices = (factors @ columns).reshape(len(rest.vertices), -1, 3).transpose(1, 0, 2)
         posed[some] = vertices if correctives is None else vertices + _turned(weights, world[some], correctives[some])
     return posed
+
+
+def rig_of(
+    rest: Rest,
+    names: Sequence[str],
+    drivers: Sequence[int],
+    corrections: NDArray[np.float64] | None = None,
+) -> Rig:
+    """Return the rig of an identity; bones that always move as their parents do are folded into them.
+
+    Parameters
+    ----------
+    rest
+        The identity; its vertices are not looked at.
+    names
+        Name of each bone.
+    drivers
+        Number of the pose joint that turns each bone, -1 for none (:func:`datagen.mesh.rig.drivers_of`).
+    corrections
+        Rotations [bone, 3, 3] by which each bone is turned before its joint's; none by default.
+    """
+    if corrections is None:
+        corrections = np.tile(np.eye(3), (len(names), 1, 1))
+    kept, part_of = list[int](), list[int]()
+    for bone, parent in enumerate(rest.parents):
+        rigid = parent >= 0 and drivers[bone] == drivers[parent]
+        if rigid and np.array_equal(corrections[bone], corrections[parent]):
+            part_of.append(part_of[parent])
+        else:
+            part_of.append(len(kept))
+            kept.append(bone)
+    folded = scipy.sparse.csr_array(rest.weights) @ np.eye(len(kept))[part_of]
+    return Rig(
+        names=tuple(names[bone] for bone in kept),
+        parents=tuple(part_of[rest.parents[bone]] if rest.parents[bone] >= 0 else -1 for bone in kept),
+        drivers=tuple(drivers[bone] for bone in kept),
+        corrections=corrections[kept],
+        weights=folded.astype(np.float32),
+        joints=rest.joints[kept].astype(np.float32),
+    )
 
 
 def _factors(vertices: NDArray[np.float64], weights: scipy.sparse.csr_array, fine: float) -> scipy.sparse.csr_array:

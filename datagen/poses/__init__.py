@@ -16,15 +16,13 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from datagen.common.assets import Asset
+from datagen.mesh.rig import driven, drivers_of, world_rotations
 from datagen.poses.skeletons import JOINTS, PARENTS
 from datagen.recipe import PoseRecipe
 
 __all__ = ["JOINTS", "PARENTS", "SOURCES", "PoseSource", "Poses", "draw_poses", "load_poses"]
-
-_GRID = 2.0**20  # rotations are rounded to this, so that sines that differ in their last bit give the same meshes
 
 
 @dataclass(frozen=True)
@@ -43,26 +41,14 @@ class Poses:
 
     def world(self) -> NDArray[np.float64]:
         """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes."""
-        matrices = Rotation.from_rotvec(self.rotations.reshape(-1, 3)).as_matrix()
-        world = matrices.reshape(*self.rotations.shape[:2], 3, 3)
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                world[:, joint] = world[:, parent] @ world[:, joint]
-        return np.round(world * _GRID) / _GRID
+        return world_rotations(self.rotations, self.parents)
 
     def on(self, names: Sequence[str | None], parents: Sequence[int]) -> NDArray[np.float64]:
         """World rotations [pose, joint, 3, 3] for another joint tree, whose joints are called ``names``.
 
         A joint whose name these poses do not have (or None) follows its parent; a root without one stays as it is.
         """
-        known = {name: number for number, name in enumerate(self.joints)}
-        mine, world = self.world(), np.empty((len(self), len(names), 3, 3))
-        for joint, (name, parent) in enumerate(zip(names, parents, strict=True)):
-            if name in known:
-                world[:, joint] = mine[:, known[name]]
-            else:
-                world[:, joint] = world[:, parent] if parent >= 0 else np.eye(3)
-        return world
+        return driven(self.world(), drivers_of(names, parents, self.joints))
 
 
 class PoseSource(Protocol):

@@ -20,11 +20,12 @@ from filelock import FileLock
 from numpy.typing import NDArray
 
 from datagen.bodies.anny.identities import Population, draw_local_changes, draw_uniform
-from datagen.bodies.anny.rigs import Rig, t_pose_corrections
+from datagen.bodies.anny.rigs import Bones, t_pose_corrections
 from datagen.bodies.anny.shape import AnnyShape
-from datagen.bodies.skinning import Rest, skin
+from datagen.bodies.skinning import Rest, rig_of, skin
 from datagen.common.assets import Asset
 from datagen.common.errors import BodyError
+from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, Poses
 from datagen.recipe import AnnyBody
 
@@ -48,11 +49,11 @@ class AnnyModel:
         )
         self.assets = _assets(recipe)
         self._faces = model.get_triangular_faces().numpy().astype(np.int32)
-        self._rig = Rig.of(recipe.rig, model.bone_labels, model.bone_parents)
+        self._bones = Bones.of(recipe.rig, model.bone_labels, model.bone_parents)
         weights = model.dense_vertex_bone_weights.numpy().astype(np.float64)
-        self._weights = scipy.sparse.csr_array(weights[:, self._rig.order])
-        heads = model.template_bone_heads.numpy()[self._rig.order]
-        self._correction = t_pose_corrections(self._rig, _y_up(heads))
+        self._weights = scipy.sparse.csr_array(weights[:, self._bones.order])
+        heads = model.template_bone_heads.numpy()[self._bones.order]
+        self._corrections = t_pose_corrections(self._bones, _y_up(heads))
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Phenotypes as the recipe's ``ages`` says, within its ranges, then local changes."""
@@ -70,18 +71,31 @@ class AnnyModel:
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32, feet and all where the body model puts them (no grounding)."""
-        return skin(self._rest(parameters), self.world_rotations(poses))
+        return skin(self.rest(parameters), self.world_rotations(poses))
 
     def world_rotations(self, poses: Poses) -> NDArray[np.float64]:
         """World rotations [pose, bone, 3, 3] of the rig's bones relative to their rest."""
-        return poses.on(self._rig.names, self._rig.parents) @ self._correction
+        return poses.on(self._bones.joints, self._bones.parents) @ self._corrections
 
-    def _rest(self, parameters: NDArray[np.float64]) -> Rest:
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """The bones that carry a pose joint; twist bones, metacarpals and the like are folded into these."""
+        drivers = drivers_of(self._bones.joints, self._bones.parents, joints)
+        return rig_of(self.rest(parameters), self._bones.labels, drivers, self._corrections)
+
+    def t_pose(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Vertices [vertex, 3] and bone heads [bone, 3] in SMPL's T-pose, which is no pose of the rig's own."""
+        rest = self.rest(parameters)
+        transforms = part_transforms(self._corrections, rest.joints, rest.parents)
+        heads = (transforms[..., :3] @ rest.joints[..., None])[..., 0] + transforms[..., 3]
+        return skin(rest, self._corrections[None])[0].astype(np.float64), heads
+
+    def rest(self, parameters: NDArray[np.float64]) -> Rest:
+        """The identity in Anny's A-pose, bones as joints."""
         points = _y_up(self._shape.points(tuple(parameters.tolist())))
         if not np.isfinite(points).all():
             raise BodyError(f"Anny gave a body with non-finite coordinates for the parameters {parameters.tolist()}")
         count = self._weights.shape[0]
-        return Rest(points[:count], points[count:][self._rig.order], self._weights, self._rig.parents)
+        return Rest(points[:count], points[count:][self._bones.order], self._weights, self._bones.parents)
 
 
 def _y_up(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -47,22 +47,28 @@ def _entries(text: str) -> list[tuple[str, list[str]]]:
 
 
 @dataclass(frozen=True)
-class Rig:
-    """Bones, parents before children: ``order`` [bone] are their numbers in Anny, ``names`` the joints they carry."""
+class Bones:
+    """A rig's bones, parents before children.
+
+    ``order`` [bone] are their numbers in Anny, ``labels`` their names there, ``joints`` the SMPL joints they carry.
+    """
 
     order: NDArray[np.int64]
-    names: tuple[str | None, ...]
+    labels: tuple[str, ...]
+    joints: tuple[str | None, ...]
     parents: tuple[int, ...]
 
     @classmethod
-    def of(cls, rig: AnnyRig, labels: Sequence[str], parents: Sequence[int]) -> "Rig":
-        """The rig whose bones Anny calls ``labels``, in any order."""
+    def of(cls, rig: AnnyRig, labels: Sequence[str], parents: Sequence[int]) -> "Bones":
+        """The bones of a rig that Anny calls ``labels``, in any order."""
         order = parents_first(parents)
         place = np.argsort(order)
-        joints = carriers(rig)
+        names = tuple(labels[bone].split(":")[-1] for bone in order)
+        carried = carriers(rig)
         return cls(
             order=order,
-            names=tuple(joints.get(labels[bone].split(":")[-1]) for bone in order),
+            labels=names,
+            joints=tuple(carried.get(name) for name in names),
             parents=tuple(int(place[parents[bone]]) if parents[bone] >= 0 else -1 for bone in order),
         )
 
@@ -79,20 +85,20 @@ def parents_first(parents: Sequence[int]) -> NDArray[np.int64]:
     return np.array(order, np.int64)
 
 
-def t_pose_corrections(rig: Rig, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World rotations [bone, 3, 3] that take the arms from rest positions ``joints`` [bone, 3] to SMPL's T-pose.
+def t_pose_corrections(bones: Bones, heads: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World rotations [bone, 3, 3] that take the arms from rest positions ``heads`` [bone, 3] to SMPL's T-pose.
 
     Upper arm, then forearm, are each turned the shortest way until they point straight to their side; what hangs on
     them goes along. The identity elsewhere. Frame: Y up, facing +Z.
     """
-    corrections = np.tile(np.eye(3), (len(rig.names), 1, 1))
+    corrections = np.tile(np.eye(3), (len(bones.joints), 1, 1))
     for side, outward in (("left", 1.0), ("right", -1.0)):
         for joint, end in (("shoulder", "elbow"), ("elbow", "wrist")):
-            bone, tip = rig.names.index(f"{side}_{joint}"), rig.names.index(f"{side}_{end}")
-            inherited = corrections[rig.parents[bone]]
-            direction = inherited @ (joints[tip] - joints[bone])
+            bone, tip = bones.joints.index(f"{side}_{joint}"), bones.joints.index(f"{side}_{end}")
+            inherited = corrections[bones.parents[bone]]
+            direction = inherited @ (heads[tip] - heads[bone])
             turn = Rotation.align_vectors([[outward, 0.0, 0.0]], [direction])[0].as_matrix()
-            corrections[_subtree(rig.parents, bone)] = turn @ inherited
+            corrections[_subtree(bones.parents, bone)] = turn @ inherited
     return corrections
 
 

@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.bodies.skinning import rig_of
 from datagen.bodies.smpl_family.blend_shapes import LayoutBody, require_betas, turned
 from datagen.bodies.smpl_family.model_file import read_arrays, read_model
 from datagen.bodies.smpl_family.model_search import FAMILIES, find_model
 from datagen.common.assets import Asset, file_asset
 from datagen.common.errors import BodyError
+from datagen.mesh.rig import Rig, drivers_of
 from datagen.poses import Poses
 from datagen.poses.skeletons import SMAL_JOINTS
 from datagen.recipe import SmalBody
@@ -66,6 +68,11 @@ class SmalModel:
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32, the root where the model puts it (no translation, no grounding)."""
         return self._body.vertices(parameters, poses.on(self._names, self._body.parents))
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """The model's joints; its pose blend shapes are no part of it."""
+        drivers = drivers_of(self._names, self._body.parents, joints)
+        return rig_of(self._body.rest(parameters), self._names, drivers)
 
 
 def _families(path: Path, betas: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

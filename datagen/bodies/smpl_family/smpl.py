@@ -8,11 +8,13 @@ roots of their four fingers, as on Anny. Hands are flat, faces neutral, unless t
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.bodies.skinning import rig_of
 from datagen.bodies.smpl_family.blend_shapes import LayoutBody, require_betas
 from datagen.bodies.smpl_family.model_file import ModelFile, read_model
 from datagen.bodies.smpl_family.model_search import FAMILIES, find_model
 from datagen.common.assets import Asset, file_asset
 from datagen.common.errors import BodyError
+from datagen.mesh.rig import Rig, drivers_of
 from datagen.poses import JOINTS, Poses
 from datagen.recipe import SmplBody
 
@@ -58,7 +60,12 @@ class SmplModel:
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32, the pelvis where the model puts it (no translation, no grounding)."""
-        return self._body.vertices(parameters, poses.on(_driven_by(self._names, poses), self._body.parents))
+        return self._body.vertices(parameters, poses.on(_driven_by(self._names, poses.joints), self._body.parents))
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """The model's joints; its pose blend shapes are no part of it."""
+        drivers = drivers_of(_driven_by(self._names, joints), self._body.parents, joints)
+        return rig_of(self._body.rest(parameters), self._names, drivers)
 
 
 def shape_parameters(file: ModelFile, model: str) -> int:
@@ -72,12 +79,12 @@ def shape_parameters(file: ModelFile, model: str) -> int:
     return min(directions, 300 if directions >= 400 else 10)
 
 
-def _driven_by(names: tuple[str, ...], poses: Poses) -> list[str]:
+def _driven_by(names: tuple[str, ...], joints: tuple[str, ...]) -> list[str]:
     """The pose joint that each joint obeys: its own, or the hand's for a knuckle that the poses do not name."""
     drivers = []
     for name in names:
         side, _, part = name.partition("_")
-        borrowed = part in _KNUCKLES and name not in poses.joints
+        borrowed = part in _KNUCKLES and name not in joints
         drivers.append(f"{side}_hand" if borrowed else name)
     return drivers
 

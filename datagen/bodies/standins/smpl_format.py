@@ -17,7 +17,6 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from datagen.bodies.anny.model import AnnyModel
-from datagen.bodies.skinning import joint_transforms, skin
 from datagen.bodies.smpl_family.model_file import NOTE, write_model
 from datagen.bodies.smpl_family.model_search import FAMILIES
 from datagen.bodies.smpl_family.smpl import joint_names
@@ -95,12 +94,12 @@ def standin(kind: Kind, *, topology: AnnyTopology = "notoes_collapse10pc") -> di
 
 def _person(kind: Kind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
     body = AnnyModel(AnnyBody(topology=topology, rig="mixamo", phenotypes=_ADULTS))
-    people = [_t_pose(body, number) for number in range(_PEOPLE)]
+    people = [body.t_pose(_identity(body, number)) for number in range(_PEOPLE)]
     vertices, heads = (np.stack(parts) for parts in zip(*people, strict=True))
     names = joint_names(kind)
     carried = _by_joint(names)
     joints = np.stack([heads[:, _pivots(name, carried[name])].mean(axis=1) for name in names], axis=1)
-    bone_weights = scipy.sparse.csr_array(body._rest(_identity(body, 0)).weights).toarray()
+    bone_weights = scipy.sparse.csr_array(body.rest(_identity(body, 0)).weights).toarray()
     weights = np.stack([bone_weights[:, carried[name]].clip(0).sum(axis=1) for name in names], axis=1)
     faces = body.faces(_identity(body, 0))
     template, shapes = principal_shapes(vertices, _SHAPES)
@@ -147,14 +146,6 @@ def _layout(
 
 def _identity(body: AnnyModel, number: int) -> NDArray[np.float64]:
     return body.draw_identity(generator(0, Stream.IDENTITY, number), number)
-
-
-def _t_pose(body: AnnyModel, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Vertices [vertex, 3] and bone heads [bone, 3] of identity ``number`` in SMPL's T-pose."""
-    rest = body._rest(_identity(body, number))
-    transforms = joint_transforms(rest, body._correction[None])[0]
-    heads = (transforms[:, :, :3] @ rest.joints[..., None])[..., 0] + transforms[:, :, 3]
-    return skin(rest, body._correction[None])[0].astype(np.float64), heads
 
 
 def _by_joint(names: tuple[str, ...]) -> dict[str, list[int]]:

@@ -73,11 +73,11 @@ class TestShape:
         model = body(phenotypes=ALL_AGES, local_changes=0.5)
         parameters = identity(model, 5)
         theirs = annys_own(rig="mixamo", topology="notoes_collapse3pc", local_changes="default")
-        rig, up = model._rig, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-        world = POSES.on(rig.names, rig.parents) @ model._correction
-        parent = np.where(np.array(rig.parents)[None, :, None, None] < 0, np.eye(3), world[:, rig.parents])
-        deltas = np.tile(np.eye(4), (len(POSES), len(rig.names), 1, 1))
-        deltas[:, rig.order, :3, :3] = up.T @ (parent.transpose(0, 1, 3, 2) @ world) @ up
+        bones, up = model._bones, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        world = model.world_rotations(POSES)
+        parent = np.where(np.array(bones.parents)[None, :, None, None] < 0, np.eye(3), world[:, bones.parents])
+        deltas = np.tile(np.eye(4), (len(POSES), len(bones.parents), 1, 1))
+        deltas[:, bones.order, :3, :3] = up.T @ (parent.transpose(0, 1, 3, 2) @ world) @ up
         named = {name: one(value) for name, value in zip(model.parameter_names, parameters, strict=True)}
         expected = theirs(
             pose_parameters=torch.from_numpy(deltas),

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from datagen.bodies import BodyModel, load_body
-from datagen.bodies.anny.rigs import Rig, carriers, parents_first, t_pose_corrections
+from datagen.bodies.anny.rigs import Bones, carriers, parents_first, t_pose_corrections
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
@@ -53,17 +53,28 @@ class TestRigs:
         assert any(np.argsort(shuffled)[parents[bone]] > place for place, bone in enumerate(shuffled) if bone)
         place = np.argsort(shuffled)
         moved = [int(place[parents[bone]]) if parents[bone] >= 0 else -1 for bone in shuffled]
-        rig = Rig.of("mixamo", [f"mixamorig:{labels[bone]}" for bone in shuffled], moved)
-        assert all(parent < bone for bone, parent in enumerate(rig.parents))
-        back = [labels[shuffled[bone]] for bone in rig.order]
-        tree = {label: back[parent] if parent >= 0 else None for label, parent in zip(back, rig.parents, strict=True)}
+        bones = Bones.of("mixamo", [f"mixamorig:{labels[bone]}" for bone in shuffled], moved)
+        assert all(parent < bone for bone, parent in enumerate(bones.parents))
+        back = [labels[shuffled[bone]] for bone in bones.order]
+        tree = {label: back[parent] if parent >= 0 else None for label, parent in zip(back, bones.parents, strict=True)}
         assert tree == {
             label: labels[parent] if parent >= 0 else None for label, parent in zip(labels, parents, strict=True)
         }
-        assert dict(zip(back, rig.names, strict=True))["Spine1"] == "spine2" and rig.names[back.index("Extra")] is None
+        assert (
+            dict(zip(back, bones.joints, strict=True))["Spine1"] == "spine2"
+            and bones.joints[back.index("Extra")] is None
+        )
 
     def test_an_ordered_rig_stays_as_it_is(self) -> None:
         assert parents_first([-1, 0, 1, 0]).tolist() == [0, 1, 2, 3]
+
+    def test_its_52_bones_make_30_parts(self) -> None:
+        """Thumbs, metacarpals and twists move as what they hang on does; fingers of a hand differ in their pivots."""
+        model = body()
+        rig = model.rig(identity(model), JOINTS)
+        assert rig is not None and len(rig.names) == 30 and {JOINTS[driver] for driver in rig.drivers} == set(JOINTS)
+        knuckles = {f"LeftHand{finger}1" for finger in ("Index", "Middle", "Ring", "Pinky")}
+        assert {name for name in rig.names if "LeftHand" in name} == {"LeftHand", *knuckles}
 
     def test_corrections_straighten_bent_arms(self) -> None:
         """An A-pose with bent elbows, twist bones between: the corrected bones point straight to their sides."""
@@ -80,7 +91,7 @@ class TestRigs:
             places += [(sign * x, y, z) for x, y, z in chain.values()]
         parents = (-1, 0, 1, 2, 3, 0, 5, 6, 7)
         joints = np.array(places)
-        corrections = t_pose_corrections(Rig(np.arange(9), tuple(names), parents), joints)
+        corrections = t_pose_corrections(Bones(np.arange(9), tuple(map(str, names)), tuple(names), parents), joints)
         for bone, tip, sign in ((1, 3, 1), (3, 4, 1), (5, 7, -1), (7, 8, -1)):
             direction = corrections[bone] @ (joints[tip] - joints[bone])
             assert direction / np.linalg.norm(direction) == pytest.approx([sign, 0, 0], abs=1e-9)

@@ -4,11 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
+from datagen.mesh.rig import rest_vertices, skinned, world_rotations
 from datagen.poses import JOINTS, Poses, draw_poses, load_poses
 from datagen.recipe import AnnyBody, DatasetRecipe, LegBody, MixedBody, PoseRecipe, RangePoses
 from tests.support.shapes.bodies import COARSE, FAMILIES, PEOPLE, recipe_parts
@@ -80,6 +83,25 @@ def test_a_batch_gives_what_single_poses_give_to_the_bit(family: Family) -> None
     assert batch.dtype == np.float32 and len(batch) == count
     for row in (0, 5, count - 1):
         assert np.array_equal(batch[row], family.body.vertices(parameters, poses[row : row + 1])[0])
+
+
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "imported"], indirect=True)
+@settings(deadline=None, max_examples=15)
+@given(number=st.integers(0, 50), seed=st.integers(0, 99))
+def test_its_rig_gives_its_vertices_without_it(family: Family, number: int, seed: int) -> None:
+    """Within ten micrometres, for random identities and random rotations of every joint that its poses turn.
+
+    Vertices at rest are found from four poses; the rig then has to give all of eight.
+    """
+    parameters, still = family.identity(number), family.still(8)
+    turns = np.random.default_rng(seed).normal(0, 0.3, still.rotations.shape)
+    poses = Poses(still.joints, still.parents, turns)
+    vertices, rig = family.body.vertices(parameters, poses), family.body.rig(parameters, poses.joints)
+    assert rig is not None and rig.weights.shape == (vertices.shape[1], len(rig.names)) and len(set(rig.names)) > 1
+    assert len(rig.joints) == len(rig.names) == len(set(rig.names)) == len(rig.parents) == len(rig.drivers)
+    transforms = rig.transforms(world_rotations(poses.rotations, poses.parents))
+    rest = rest_vertices(vertices[:4], rig.weights, transforms[:4])
+    assert np.abs(skinned(rest, rig.weights, transforms) - vertices).max() < 1e-5
 
 
 def test_its_assets_say_what_it_is_made_from(family: Family) -> None:

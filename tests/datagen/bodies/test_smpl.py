@@ -20,6 +20,7 @@ from datagen.bodies.smpl_family.smpl import SmplModel, joint_names
 from datagen.bodies.standins.smpl_format import standin, write_standin
 from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
+from datagen.mesh.rig import skinned
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, MixedBody, PoseRecipe, RangePoses, SmplBody
 from tests.support.shapes.models import arrays_of, random_model, reference, save_npz, tree
@@ -144,6 +145,31 @@ def test_pose_blend_shapes_see_rotations_relative_to_the_parent(tmp_path: Path) 
     quarter = Rotation.from_rotvec(bent[1, 0]).as_matrix()
     difference = around - straight @ quarter.T
     assert np.ptp(difference, axis=0).max() < 4e-6, "up to where the pelvis lies"
+
+
+def test_a_rig_leaves_out_the_pose_blend_shapes_and_nothing_else(tmp_path: Path) -> None:
+    """Added to the vertices at rest they give the body's; without them the rig is off by what they displace."""
+    path = save_npz(tmp_path / "m.npz", arrays_of("smpl"))
+    body, layout = SmplModel(SmplBody(path=str(path))), LayoutBody(read_model(path), betas=10, reach=4)
+    betas, world = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0), NPT.on(JOINTS, PARENTS)
+    rig, rest, displaced = body.rig(betas, JOINTS), layout.rest(betas).vertices, layout.correctives(world)
+    posed, transforms = body.vertices(betas, NPT), rig.transforms(NPT.world())
+    with_them = [
+        skinned(rest + its, rig.weights, its_transforms[None])[0]
+        for its, its_transforms in zip(displaced, transforms, strict=True)
+    ]
+    assert np.abs(with_them - posed).max() < 1e-5
+    lacking = np.linalg.norm(skinned(rest, rig.weights, transforms) - posed, axis=-1)
+    assert 0.01 < lacking.max() <= np.linalg.norm(displaced, axis=-1).max() + 1e-5
+
+
+@pytest.mark.parametrize(("model", "kept"), [("smpl", 24), ("smplh", 30), ("smplx", 30)])
+def test_joints_that_the_poses_do_not_turn_are_folded(model: str, kept: int, stand_ins: Path) -> None:
+    """Of SMPL-H's and SMPL-X' fingers the four knuckles of each hand remain, which obey its hand joint."""
+    rig = SmplModel(SmplBody(model=model, path=str(stand_ins))).rig(np.zeros(10), JOINTS)
+    assert len(rig.names) == kept and not {"left_index2", "right_thumb1", "jaw"} & set(rig.names)
+    turning = [JOINTS[driver] for driver in rig.drivers]
+    assert set(turning) == set(JOINTS) and turning.count("left_hand") == (1 if model == "smpl" else 4)
 
 
 def test_identities_are_npts(stand_ins: Path) -> None:

@@ -11,7 +11,7 @@ from datagen.bodies.smpl_family.model_file import KEYS, read_model
 from datagen.bodies.smpl_family.smpl import joint_names
 from datagen.bodies.standins.fit import fit_regressor, principal_shapes
 from datagen.bodies.standins.quadruped import quadruped
-from datagen.bodies.standins.smpl_format import _ADULTS, _by_joint, _pivots, _t_pose, standin, write_standin
+from datagen.bodies.standins.smpl_format import _ADULTS, _by_joint, _pivots, standin, write_standin
 from datagen.bodies.standins.surface_nets import surface_nets
 from datagen.common.errors import BodyError, StorageError
 from datagen.common.seeding import Stream, generator
@@ -64,7 +64,7 @@ def test_regressed_joints_lie_where_annys_do(kind: str, files: dict[str, Path]) 
     bones = {name: _pivots(name, carried) for name, carried in _by_joint(names).items()}
     apart = []
     for number in range(500, 520):
-        vertices, heads = _t_pose(body, number)
+        vertices, heads = body.t_pose(body.draw_identity(generator(0, Stream.IDENTITY, number), number))
         truth = np.stack([heads[bones[name]].mean(axis=0) for name in names])
         apart.append(np.linalg.norm(regressor @ vertices - truth, axis=1))
     assert np.mean(apart) < 0.0025 and np.max(apart) < 0.018
@@ -74,7 +74,9 @@ def test_new_people_of_anny_are_within_the_shape_space(files: dict[str, Path]) -
     model = read_model(files["smpl"])
     body = AnnyModel(AnnyBody(topology=COARSE, rig="mixamo", phenotypes=_ADULTS))
     for number in range(500, 510):
-        offset = (_t_pose(body, number)[0] - model.template).ravel()
+        offset = (
+            body.t_pose(body.draw_identity(generator(0, Stream.IDENTITY, number), number))[0] - model.template
+        ).ravel()
         directions = model.shapedirs.reshape(-1, 10)
         betas, *_ = np.linalg.lstsq(directions, offset, rcond=None)
         left = np.linalg.norm((offset - directions @ betas).reshape(-1, 3), axis=1)
