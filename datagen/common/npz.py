@@ -3,6 +3,7 @@
 import io
 import lzma
 import math
+import os
 import struct
 import zipfile
 import zlib
@@ -13,6 +14,9 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from datagen.common.errors import UnsafeFileError
+from datagen.common.files import open_regular
 
 FAULTS = (
     OSError, EOFError, ValueError, TypeError, LookupError, OverflowError, SyntaxError, RuntimeError, MemoryError,
@@ -26,6 +30,8 @@ Header = tuple[tuple[int, ...], "np.dtype[Any]"]
 LARGEST = 2**30
 """Bytes at most of an archive, and of all arrays that are read of it; SMPL-X's arrays have a third of it."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # NumPy's; others unpack without a limit
+_DIRECTORY = 2**20
+"""Bytes at most of an archive's directory, which is read whole; archives of poses and models have some thousand."""
 HEADER = 2**14
 """Bytes in which the header of an .npy file ends: NumPy takes none of more than 10,000 letters."""
 
@@ -37,14 +43,26 @@ def opened(path: Path) -> Iterator[zipfile.ZipFile]:
     Raises
     ------
     ValueError
-        It is no regular file, or longer than any.
+        It is no regular file, or it or its directory is longer than any.
     """
-    if path.exists() and not path.is_file():
-        raise ValueError("it is no regular file")  # opening a pipe would wait
-    if path.stat().st_size > LARGEST:
-        raise ValueError(f"it has more than {LARGEST:,} bytes")
-    with zipfile.ZipFile(path) as archive:
-        yield archive
+    try:
+        file = open_regular(path)
+    except UnsafeFileError as error:
+        raise ValueError("it is no regular file") from error
+    with file:
+        if os.fstat(file.fileno()).st_size > LARGEST:
+            raise ValueError(f"it has more than {LARGEST:,} bytes")
+        _require_short_directory(file)
+        with zipfile.ZipFile(file) as archive:
+            yield archive
+
+
+def _require_short_directory(file: IO[bytes]) -> None:
+    """Ask what ZipFile itself goes by, ZIP64 included: it reads so many bytes, and makes an object of each entry."""
+    end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
+    size = end[zipfile._ECD_SIZE] if end else 0  # type: ignore[attr-defined]
+    if size > _DIRECTORY:
+        raise ValueError(f"its directory has {size:,} bytes, at most {_DIRECTORY:,} are read")
 
 
 def member_bytes(archive: zipfile.ZipFile, name: str, *, limit: int = LARGEST) -> bytes:
@@ -116,6 +134,8 @@ def array_header(content: IO[bytes]) -> Header:
         It is no such file, or of a version that is not known.
     """
     version = np.lib.format.read_magic(content)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"its format version {version} is not known")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = read(content)
     return shape, kind

@@ -1,5 +1,6 @@
 """Mesh files and archives of somebody else's that want more than to be read: one line, at once, and little memory."""
 
+import io
 import json
 import os
 import pickle
@@ -364,6 +365,31 @@ def test_archives_that_unpack_to_more_than_they_say_are_not_unpacked(
     with within(2), pytest.raises(FAULTS if reader == "arrays" else DsffnetError) as caught:
         readers[reader]()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("zip64", [False, True])
+def test_an_archive_of_a_million_members_is_refused_before_its_directory_is_read(tmp_path: Path, zip64: bool) -> None:
+    """Here one 40,000 times; ZIP64 says elsewhere how long its directory is."""
+    path = tmp_path / "x.npz"
+    np.savez(path, poses=np.zeros(3))
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.filelist += archive.filelist * 40_000
+        archive.writestr("last", b"")
+    if zip64:
+        content = path.read_bytes()
+        end, place = content[-22:], len(content) - 22
+        counts = struct.unpack("<HHII", end[8:20])
+        record = struct.pack("<4sQHHIIQQQQ", b"PK\x06\x06", 44, 45, 45, 0, 0, *counts)
+        locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, place, 1)
+        path.write_bytes(content[:place] + record + locator + end[:8] + b"\xff" * 12 + end[20:])
+    with pytest.raises(ValueError, match="its directory has 2,"):
+        read_arrays(path, ("poses",))
+
+
+def test_an_array_of_an_unknown_version_is_refused() -> None:
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }\n"
+    with pytest.raises(ValueError, match=r"its format version \(9, 9\) is not known"):
+        archives.array_header(io.BytesIO(b"\x93NUMPY\x09\x09" + struct.pack("<I", len(header)) + header))
 
 
 @pytest.mark.parametrize(
