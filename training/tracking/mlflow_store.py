@@ -7,19 +7,18 @@ where the folder lies elsewhere by now.
 
 import logging
 import os
+import re
+import shlex
 import sqlite3
 import unicodedata
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from urllib.parse import quote, urlsplit
-from urllib.request import url2pathname
-
-from filelock import FileLock
+from urllib.parse import quote
 
 from datagen.common.errors import RecipeError, StorageError, UnsafeFileError
-from datagen.common.files import resolve_within
+from datagen.common.files import lock_within, resolve_within
 from training.tracking.record import EXPERIMENT, Server
 
 log = logging.getLogger(__name__)
@@ -63,18 +62,20 @@ def prepare_store(server: Server) -> None:
     Raises
     ------
     StorageError
-        The file is no database, or holds runs in tables that this MLflow does not use.
+        The file is no database, holds runs in tables that this MLflow does not use, or cannot be used now.
     UnsafeFileError
-        The store is the folder's own, and it or its artifacts lead out of the folder.
+        The store is the folder's own, and it or its artifacts lead out of the folder, or it holds what is executed.
     """
     database = sqlite_file(server.uri)
     if database is None:
         return
     if server.own:
         _refuse_links(database)
+        if database.exists():
+            _refuse_code(database)
     if not _is_whole(database):
         database.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{database}.lock").acquire(timeout=_SECONDS):
+        with lock_within(database.parent, f"{database.name}.lock").acquire(timeout=_SECONDS):
             if not _is_whole(database):
                 _set_aside(database)
                 _make(database)
@@ -82,6 +83,43 @@ def prepare_store(server: Server) -> None:
         _correct_places(database, server.artifacts)
     if server.own and server.artifacts:
         _refuse_places_elsewhere(database, server.artifacts)
+
+
+def require_inside(place: object, database: Path, artifacts: Path) -> None:
+    """Refuse a place of artifacts, as MLflow notes it, that is not in the folder ``artifacts``.
+
+    Raises
+    ------
+    UnsafeFileError
+        It is elsewhere: MLflow would read and write there.
+    """
+    if not _is_inside(place, artifacts):
+        raise UnsafeFileError(
+            f"{database} notes artifacts at {str(place)[:200]!r}, outside its folder. If the folder was moved without "
+            f"its mlartifacts, move {database.name} away and run again: a new store gets all that the folder still "
+            f"holds. If you put them there, {_name_it(database)}"
+        )
+
+
+def _is_inside(place: object, artifacts: Path) -> bool:
+    from mlflow.utils.file_utils import local_file_uri_to_path
+
+    if not isinstance(place, str) or not place.startswith("file:///"):  # of others MLflow's reading is not one path
+        return isinstance(place, str) and _SERVED.fullmatch(place) is not None
+    try:
+        local = os.path.realpath(local_file_uri_to_path(place))
+    except ValueError:  # a NUL in it
+        return False
+    return Path(local).is_relative_to(os.path.realpath(artifacts))
+
+
+_SERVED = re.compile(r"mlflow-artifacts:(/[\w-]+)+")
+"""What a person logs to the server of ``dsffnet ui``, which keeps it beside the store."""
+
+
+def _name_it(database: Path) -> str:
+    uri = shlex.quote(f"{_SCHEME}{database}")
+    return f"name the store: --tracking-uri {uri}; its pages: mlflow ui --backend-store-uri {uri}"
 
 
 def _is_whole(database: Path) -> bool:
@@ -160,31 +198,51 @@ def _refuse_links(database: Path) -> None:
         link = next((name for name in (*folders, *files) if os.path.islink(os.path.join(folder, name))), None)
         if link is not None:
             raise UnsafeFileError(
-                f"{folder} holds a link, {link!r}, through which MLflow would write. If it is yours, name the store: "
-                f"--tracking-uri {_SCHEME}{database}"
+                f"{folder} holds a link, {link!r}, through which MLflow would write. If it is yours, "
+                f"{_name_it(database)}"
             )
 
 
-def _refuse_places_elsewhere(database: Path, artifacts: Path) -> None:
-    """Refuse a store that notes artifacts of our runs outside the folder ``artifacts``."""
-    root = Path(os.path.realpath(artifacts))
+_HARMLESS = re.compile(r"CREATE (TABLE|INDEX|UNIQUE INDEX|TRIGGER \w+\s+BEFORE UPDATE ON secrets)\s")
+"""The statements that MLflow's own schema is made of. Views, virtual tables and triggers of others would be executed
+with what is asked and written."""
+
+
+def _refuse_code(database: Path) -> None:
+    """Refuse a store with a schema that does more than to hold what is written to it."""
     with _opened(database) as connection:
-        for (place,) in connection.execute(_OUR_PLACES, {"name": EXPERIMENT}):
-            local = url2pathname(urlsplit(place).path) if urlsplit(place).scheme == "file" else None
-            if local is None or not Path(os.path.realpath(local)).is_relative_to(root):
+        for kind, name, statement in connection.execute("SELECT type, name, sql FROM sqlite_master"):
+            if statement is not None and not _HARMLESS.match(str(statement)):
                 raise UnsafeFileError(
-                    f"{database} notes artifacts at {place!r}, outside its folder. If you put them there, name the "
-                    f"store: --tracking-uri {_SCHEME}{database}"
+                    f"{database} holds a {str(kind)[:20]}, {str(name)[:80]!r}, that MLflow does not make and SQLite "
+                    "would execute. Do not trust it; move it away, and a new one is made"
                 )
 
 
-_OUR_PLACES = """
-WITH ours AS (SELECT experiment_id FROM experiments WHERE name = :name)
+def _refuse_places_elsewhere(database: Path, artifacts: Path) -> None:
+    """Refuse a store that notes artifacts outside the folder ``artifacts``."""
+    accepted = _accepted(database)
+    with _opened(database) as connection:
+        for (place,) in connection.execute(_USED_PLACES, {"name": EXPERIMENT}):
+            if place not in accepted:
+                require_inside(place, database, artifacts)
+                accepted.add(place)
+
+
+@cache
+def _accepted(database: Path) -> set[str]:
+    """Places of a store that were found to be inside: of many runs each is resolved once a process."""
+    return set()
+
+
+_USED_PLACES = """
 SELECT artifact_location FROM experiments WHERE name = :name
-UNION SELECT artifact_uri FROM runs WHERE experiment_id IN ours
-UNION SELECT artifact_location FROM logged_models WHERE experiment_id IN ours
+UNION SELECT artifact_uri FROM runs
+UNION SELECT artifact_location FROM logged_models
+UNION SELECT coalesce(storage_location, source) FROM model_versions
 """
-"""Wherever something of the project's experiment is written to."""
+"""Wherever the project's experiment is written to, and all that is read by MLflow's registry and pages: of other
+experiments not their own places, as MLflow's "Default" is noted in the folder that a command was started in."""
 
 
 def _holds_artifacts(connection: sqlite3.Connection, there: str, artifacts: Path) -> bool:
@@ -200,8 +258,10 @@ def _opened(database: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_SECONDS)) as connection:
             yield connection
-    except sqlite3.OperationalError:  # locked, read-only, a broken disk: nothing is wrong with the file
-        raise
+    except sqlite3.OperationalError as error:  # locked, read-only, a broken disk: nothing is wrong with the file
+        raise StorageError(
+            f"{database} cannot be used now ({error}). Run again once it is free and writable"
+        ) from error
     except sqlite3.DatabaseError as error:
         raise StorageError(f"{database} is no MLflow store ({error}). Move it away, and a new one is made") from error
 

@@ -16,8 +16,9 @@ import mlflow.store.db.utils as mlflow_tables
 import pytest
 from mlflow.tracking._tracking_service.utils import _artifact_repos_cache
 
-from datagen.common.errors import RecipeError, TrackingError
+from datagen.common.errors import RecipeError, StorageError, TrackingError, UnsafeFileError
 from tests.support.files import tree_hash
+from training.tracking import mlflow_store
 from training.tracking.mlflow_mirror import publish
 from training.tracking.mlflow_store import prepare_store, sqlite_server
 from training.tracking.record import EXPERIMENT, Server, begin_record, update_record
@@ -220,6 +221,80 @@ def test_a_run_of_a_store_that_came_with_its_folder_is_written_beside_it(
     with pytest.raises(TrackingError, match="outside its folder"):
         publish(out, server(out))
     assert tree_hash(out / "mlartifacts") == before and not (tmp_path / "figures").exists()
+
+
+_ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n)"
+CODE = {
+    "a trigger": ["CREATE TRIGGER t AFTER INSERT ON runs BEGIN UPDATE runs SET artifact_uri='file:///victim'; END"],
+    "a view": ["ALTER TABLE runs RENAME TO r", f"CREATE VIEW runs AS {_ENDLESS} SELECT i AS artifact_uri FROM n"],
+    "a virtual table": ["CREATE VIRTUAL TABLE t USING fts5(x)"],
+}
+
+
+@pytest.mark.parametrize("statements", CODE.values(), ids=CODE)
+def test_what_a_store_that_came_with_its_folder_would_execute_is_refused(
+    tmp_path: Path, empty_store: Path, statements: list[str]
+) -> None:
+    """A trigger moves a run's artifacts after its places were looked at; a view may have rows without end."""
+    database = tmp_path / "mlflow.db"
+    shutil.copy(empty_store, database)
+    with closing(sqlite3.connect(database, isolation_level=None)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    before = database.read_bytes()
+    with pytest.raises(UnsafeFileError, match="that MLflow does not make and SQLite would execute"):
+        prepare_store(sqlite_server(database, own=True))
+    assert database.read_bytes() == before
+
+
+def test_a_place_that_is_no_path_is_said_in_one_short_line(tmp_path: Path, empty_store: Path) -> None:
+    """With what to do: of pages too, whose command has no --tracking-uri."""
+    out = recorded(tmp_path / "o u t", empty_store)
+    publish(out, server(out))
+    database = out / "mlflow.db"
+    for place in ("file://[", "file:///%00", "file:///" + "x" * 3_000_000, "mlflow-artifacts:/1/../2", "models:/m/1"):
+        with closing(sqlite3.connect(database)) as connection, connection:
+            connection.execute("UPDATE runs SET artifact_uri = ?", [place])
+        with pytest.raises(UnsafeFileError, match="outside its folder") as raised:
+            prepare_store(server(out))
+        said = str(raised.value)
+        assert len(said) < 1500 and "moved without its mlartifacts, move mlflow.db away and run again" in said
+        uri = f"'sqlite:///{database}'"
+        assert said.endswith(f"name the store: --tracking-uri {uri}; its pages: mlflow ui --backend-store-uri {uri}")
+
+
+def test_runs_of_others_in_the_store_of_a_folder_lie_in_it_too(tmp_path: Path, empty_store: Path) -> None:
+    """MLflow's pages show them; what a person logs to the server of those pages is kept beside the store."""
+    out = recorded(tmp_path / "out", empty_store)
+    client = mlflow.MlflowClient(server(out).uri)
+    client.create_run(client.create_experiment("mine", "mlflow-artifacts:/1"))
+    publish(out, server(out))
+    client.create_run(client.create_experiment("theirs", tmp_path.as_uri()))
+    with pytest.raises(UnsafeFileError, match="outside its folder"):
+        prepare_store(server(out))
+
+
+def test_places_are_resolved_once_a_process(tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = recorded(tmp_path / "out", empty_store)
+    publish(out, server(out))
+    prepare_store(server(out))
+    monkeypatch.setattr(mlflow_store, "require_inside", lambda *_: pytest.fail("again"))
+    prepare_store(server(out))
+
+
+def test_a_store_that_is_locked_or_whose_lock_is_a_link_is_one_line(tmp_path: Path, empty_store: Path) -> None:
+    out = recorded(tmp_path / "out", empty_store)
+    with closing(sqlite3.connect(out / "mlflow.db")) as connection:
+        connection.execute("BEGIN EXCLUSIVE")
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(mlflow_store, "_BUSY_SECONDS", 0.01)
+            with pytest.raises(StorageError, match=r"cannot be used now \(database is locked\)\. Run again once"):
+                prepare_store(server(out))
+    (out / "mlflow.db").unlink()
+    (out / "mlflow.db.lock").symlink_to(tmp_path / "victim")
+    with pytest.raises(UnsafeFileError, match=r"'mlflow\.db\.lock', a link"):
+        prepare_store(server(out))
+    assert not (tmp_path / "victim").exists()
 
 
 @pytest.mark.parametrize("name", ["mlflow.db", "mlartifacts", "mlartifacts/1/x/artifacts/figures/curve.png"])
