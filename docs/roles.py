@@ -16,7 +16,7 @@ class _Roles(Preprocessor):
 
 
 class _RolesExtension(Extension):
-    def extendMarkdown(self, md: Markdown) -> None:  # noqa: N802 - the name that Markdown calls
+    def extendMarkdown(self, md: Markdown) -> None:
         md.preprocessors.register(_Roles(md), "roles", 26)
 
 
