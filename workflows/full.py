@@ -16,139 +16,119 @@ _ROOT = str(Path(__file__).resolve().parents[1])
 if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its files would hide packages
     sys.path[0] = _ROOT
 
+import argparse
+import shlex
+import shutil
 from contextlib import ExitStack
-from functools import partial
 
 from datagen.common.files import read_text_within
-from datagen.store import open_dataset
-from datagen.store.attributes import check_same_recipe
-from datagen.store.schema import open_group
 from training.reports.report import NAMES, report_is_current, workflow_report
 from training.tracking.mlflow_mirror import Mirror
-from training.tracking.record import has_record, read_record, update_record
-from workflows.pipeline.console import (
+from training.tracking.mlflow_store import sqlite_file
+from training.tracking.record import ALIAS, EXPERIMENT, MODEL, Server, has_record, read_record, update_record
+from workflows.cli.declare import (
+    add_fresh_option,
     add_local_option,
-    alone_in,
-    closing_words,
-    guarded,
-    print_text,
-    server_of,
-    start_over,
-    workflow_parser,
+    add_recipe_options,
+    add_tracking_option,
+    add_yes_option,
+    recipe_keys,
 )
+from workflows.pipeline.console import guarded, print_text, server_of
 from workflows.pipeline.data_size import announce_size
+from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
+from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
-from workflows.pipeline.stage import Stage, once, refuse_other_kind, run_stage
-from workflows.pipeline.stage_functions import (
-    check_run_accepts,
-    evaluate_stage,
-    generate_stage,
-    is_complete,
-    is_evaluated,
-    is_trained,
-    recorded,
-    train_stage,
-)
+from workflows.pipeline.run_folder import SingleRunFolder
+from workflows.pipeline.stage import Stage, once, recorded, run_stage
 from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import is_trained, refuse_conflicts, train_model
 from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse, then run the stages while a mirror keeps MLflow up to date."""
-    parser = workflow_parser(__doc__ or "")
-    add_local_option(parser)
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     recipe = load_recipe(options.recipe, options.set)
-    name = Path(options.recipe).stem
-    out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
-    announce_size(recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes, local=options.local)
-    server = server_of(out, options.tracking_uri)
-    mirror = Mirror(out, server)
-    with alone_in(out):
+    out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
+    folder, server = SingleRunFolder(out), server_of(out, options.tracking_uri)
+    announce_size(recipe.data, folder.data, anew=options.fresh, yes=options.yes, local=options.local)
+    with folder.alone():
         if options.fresh:
-            start_over(out)
-        mirror.start()
-        try:
+            folder.remove()
+        with Mirror(out, server):
             run_workflow(recipe, out, TaskRunner(local=options.local))
-        finally:
-            outage = mirror.close()
-    print_text(closing_words(out, server))
-    if outage:
-        raise outage
+            print_text(closing_words(folder, server))
+
+
+def _parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser(
+        description=__doc__, epilog=recipe_keys(), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_recipe_options(made)
+    made.add_argument("--out", metavar="DIR", help="folder for dataset, run and MLflow store (default runs/RECIPE)")
+    add_tracking_option(made)
+    add_fresh_option(made, "what DIR holds of this workflow")
+    add_yes_option(made)
+    add_local_option(made)
+    return made
 
 
 def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     """All stages of a recipe into the folder ``out``; finished ones are skipped, and Ray starts for a stage with much
     to do.
     """
-    data, run = str(out / "dataset.zarr"), out / "run"
+    folder = SingleRunFolder(out)
+    data, run = folder.data, folder.run
     sections = recipe.model_dump(mode="json")
-    refuse_other_kind(out, "workflow")
     known = has_record(out)  # the record of the whole is made again with what it shows: the evaluation and the report
-    _refuse_conflicts(recipe, data, run)
+    refuse_conflicts(recipe.data, folder, {run.path: recipe.training})
     with ExitStack() as around:
-        begin = once(lambda: _begin(around, recipe, out, tasks))
-        generate = Stage(
-            "generate",
-            depends_on=sections["data"],
-            intact=lambda: is_complete(data) and has_record(out / "generate"),
-            work=partial(generate_stage, recipe.data, data, folder=out / "generate", parent=out, tasks=tasks),
-        )
+        begin = once(lambda: _begin(around, recipe, folder, tasks))
         train = Stage(
             "train",
             depends_on=[sections["data"], sections["training"]],
-            intact=lambda: is_trained(recipe.training, data, run) and has_record(run),
-            work=partial(train_stage, recipe.training, data, run, parent=out, tasks=tasks),
+            intact=lambda: is_trained(recipe.training, data, run.path) and has_record(run.path),
+            work=lambda: train_model(recipe.training, data, run, parent=out, tasks=tasks),
         )
         evaluate = Stage(
             "evaluate",
             depends_on=[sections["data"], sections["training"], sections["evaluation"]],
             intact=lambda: known and is_evaluated(recipe.evaluation, data, run),
-            work=partial(_evaluate, recipe, data, run, out, tasks),
+            work=lambda: _evaluate(recipe, folder, tasks),
         )
-        for stage in (generate, train, evaluate):
-            run_stage(stage, out=out, before=begin)
         report = Stage(
             "report",
             depends_on=sections,
             intact=lambda: known and report_is_current(out),
             work=lambda: _report(out),
         )
+        for stage in (generate_stage(recipe.data, folder, tasks), train, evaluate):
+            run_stage(stage, out=out, before=begin)
         run_stage(report, out=out, before=lambda: None)
 
 
-def _refuse_conflicts(recipe: WorkflowRecipe, data: str, run: Path) -> None:
-    """Refuse a folder whose dataset or run was made by another recipe, before anything in it is touched."""
-    if not (Path(data) / "zarr.json").exists():
-        return
-    group = open_group(data)
-    if "format_version" in group.attrs:  # it is missing where the very first write was cut short
-        check_same_recipe(data, group, recipe.data)
-    if is_complete(data):
-        check_run_accepts(recipe.training, open_dataset(data), run)
-
-
-def _begin(around: ExitStack, recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
+def _begin(around: ExitStack, recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:
     """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a place for tasks."""
-    save_recipe(recipe, out / "recipe.yaml")
-    parameters = recipe.model_dump(mode="json")
-    around.enter_context(recorded(out, kind="workflow", name=out.name, parent=None, parameters=parameters))
+    out, parameters = folder.path, recipe.model_dump(mode="json")
+    save_recipe(recipe, folder.recipe)
+    around.enter_context(recorded(out, kind=folder.kind, name=out.name, parent=None, parameters=parameters))
     update_record(out, artifacts=["recipe.yaml"])
     around.enter_context(tasks)
 
 
-def _evaluate(recipe: WorkflowRecipe, data: str, run: Path, out: Path, tasks: TaskRunner) -> None:
+def _evaluate(recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:
     """Evaluate, and give the parent record what a person wants to see first: table, pictures, main metrics."""
-    evaluate_stage(recipe.evaluation, data, run, parent=out, tasks=tasks)
-    evaluation = run / "evaluation"
-    parent, child = read_record(out), read_record(evaluation)
+    out, evaluation = folder.path, folder.run.evaluation
+    table = evaluate_weights(recipe.evaluation, folder.data, folder.run.path, parent=out, tasks=tasks)
+    parent, child = read_record(out), read_record(evaluation.path)
     assert parent is not None and child is not None
-    shown = [os.path.relpath(evaluation / name, out) for name in ("tables.md", "viewer.html", "figures")]
+    shown = [os.path.relpath(path, out) for path in (evaluation.tables, evaluation.viewer, evaluation.figures)]
     update_record(
         out,
         artifacts=["recipe.yaml", *shown],
         metrics=child.metrics,
-        tags=parent.tags | {"mlflow.note.content": read_text_within(evaluation, "tables.md")},
+        tags=parent.tags | {"mlflow.note.content": table},
     )
 
 
@@ -158,6 +138,48 @@ def _report(out: Path) -> None:
     record = read_record(out)
     assert record is not None
     update_record(out, artifacts=[*NAMES, *(name for name in record.artifacts if name not in NAMES)])
+
+
+def closing_words(folder: SingleRunFolder, server: Server) -> str:
+    """The table, where everything lies, and what to try next."""
+    out = folder.path
+    table = read_text_within(folder.run.evaluation.path, "tables.md")
+    shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
+    run = shlex.quote(str(shown / "run"))
+    here = shown / "run" / "evaluation"
+    meshes = shlex.quote(str(here / "meshes"))
+    programs = _programs()
+    dsffnet = f"{programs}dsffnet"
+    ui = (
+        f"make ui OUT={shlex.quote(str(shown).replace('$', '$$'))}"
+        if sqlite_file(server.uri) == out / "mlflow.db"
+        else f"look at MLflow ({server.uri}), experiment {EXPERIMENT!r}"
+    )
+    return f"""
+{table}
+Where everything lies
+  report        {shown}/report.html, report.md  (all of this on one page, with cards of data and model)
+  pictures      {here}/figures/examples.png, training-curve.png
+  viewer        {here}/viewer.html  (turn and zoom; open it in a browser)
+  meshes        {here}/meshes/*.glb
+  table, rows   {here}/tables.md, rows.csv
+  run           {run}  (weights in checkpoints/, metrics.jsonl)
+  dataset       {shown}/dataset.zarr
+  MLflow        {server.uri}, experiment {EXPERIMENT!r}, model 'models:/{MODEL}@{ALIAS}'
+
+Try next
+  {ui}
+  {dsffnet} transfer --model {run} --source {meshes}/00-source.glb --target {meshes}/01-target.glb --out posed.glb
+  {programs}python workflows/full.py --out runs/custom --set data.identities.seed=7 data.identities.training=24
+"""
+
+
+def _programs() -> str:
+    """Folder of this environment's programs with a slash behind it, or nothing where the shell finds them anyway."""
+    here = Path(sys.executable).parent
+    if shutil.which("dsffnet") == str(here / "dsffnet"):
+        return ""
+    return f"{os.path.relpath(here) if here.is_relative_to(Path.cwd()) else here}/"
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from datagen.common.errors import DatasetError
-from datagen.generate import append, generate, inline, repair
+from datagen.generate import append, generate, repair
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.schema import open_group, read_bytes, shard_path, write_bytes
@@ -24,8 +24,10 @@ from tests.support.files import tree_hash
 from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
-from workflows.pipeline import stage_functions as pipeline
-from workflows.pipeline.stage_functions import evaluate_stage, train_stage
+from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
+from workflows.pipeline.run_folder import RunFolder
+from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import train_model
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
 ROOT = Path(__file__).parents[2]
@@ -223,15 +225,16 @@ def test_two_generators_on_one_s3_dataset_do_no_harm(bucket: str, dataset: str) 
 
 
 def test_a_dataset_on_s3_is_trained_on_and_evaluated_as_one_on_the_disk(
-    bucket: str, dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: str, dataset: str, tmp_path: Path
 ) -> None:
     url, recipe = f"{bucket}/evaluated.zarr", EvaluationRecipe(emd_points=16, examples=1, chunk=2)
     generate(tiny_dataset(), url)
-    monkeypatch.setattr(pipeline, "ray_runner", inline)
+    tasks = TaskRunner(local=True)
     for place, name in ((url, "afar"), (dataset, "here")):
-        train_stage(tiny_training(), place, tmp_path / name, parent=None)
-        evaluate_stage(recipe, place, tmp_path / name, parent=tmp_path / name)
-        assert pipeline.is_evaluated(recipe, place, tmp_path / name)
+        run = RunFolder(tmp_path / name)
+        train_model(tiny_training(), place, run, parent=None, tasks=tasks)
+        evaluate_weights(recipe, place, run.path, parent=run.path, tasks=tasks)
+        assert is_evaluated(recipe, place, run)
     afar, here = (tmp_path / name / "evaluation" for name in ("afar", "here"))
     assert (afar / "rows.csv").read_bytes() == (here / "rows.csv").read_bytes()
     names = {str(path.relative_to(here)) for path in here.rglob("*") if path.is_file()}

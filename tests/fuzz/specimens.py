@@ -119,12 +119,12 @@ def _make_run(folder: Path, specimens: Specimens) -> None:
     """A run of four steps with two checkpoints, its record and its origin; half of it; two meshes to transfer with."""
     from training.engine.trainer import train
     from training.tracking.record import begin_record, end_record
-    from workflows.pipeline.stage_functions import write_run_head
+    from workflows.pipeline.train import write_head
 
     recipe = tiny_training(steps=4, checkpoint_every=2, evaluate_every=2, average=0.9)
     run, dataset = folder / "run", open_dataset(str(specimens.dataset))
     begin_record(run, name="train", kind="train", parent=None, parameters={"training.batch": "4"})
-    write_run_head(recipe, dataset, run)
+    write_head(recipe, dataset, run)
     origin = json.loads((run / "provenance.json").read_text())
     origin["dataset"]["url"] = "leg.zarr"
     (run / "provenance.json").write_text(json.dumps(origin))

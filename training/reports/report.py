@@ -23,7 +23,8 @@ from training.reports.card_texts import NETWORKS, span, vertex_counts
 from training.reports.cards import dataset_card, model_card
 from training.reports.html import report_html
 from training.reports.markdown import report_markdown
-from training.reports.run_summary import this_commit, this_machine, what_was_run
+from training.reports.run_summary import what_was_run
+from training.tracking.provenance import this_commit, this_machine
 from training.tracking.record import read_record
 
 __all__ = [

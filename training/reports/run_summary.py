@@ -2,17 +2,13 @@
 
 import importlib.metadata
 import os
-import platform
 import re
 import shlex
-import subprocess
 import time
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-import psutil
 from pydantic import Field, TypeAdapter
 from typing_extensions import TypedDict
 
@@ -22,7 +18,7 @@ from datagen.common.json_files import read_json
 from training.evaluation.document import Table
 from training.reports.blocks import Block, Code, Facts, Section, shown
 from training.tracking.journal import read_journal
-from training.tracking.provenance import Provenance, provenance_of
+from training.tracking.provenance import Provenance, provenance_of, this_commit, this_machine
 from training.tracking.record import Record, find_records, read_record
 
 COMMAND_TAG = "dsffnet.command"
@@ -46,26 +42,6 @@ def what_was_run(out: Path) -> Section:
     with suppress(FileNotFoundError):
         body.append(Code(read_text_within(out, "recipe.yaml"), folded="The whole recipe (recipe.yaml)"))
     return Section("What was run", tuple(body))
-
-
-def this_machine() -> dict[str, str]:
-    """Processor, memory, system and GPUs of this machine, for people; no name that would tell whose it is."""
-    facts = {
-        "processor": f"{_processor()}, {_cores()} cores",
-        "memory": f"{psutil.virtual_memory().total / 2**30:.0f} GiB",
-        "GPU": _gpus(),
-        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
-    }
-    return {name: fact for name, fact in facts.items() if fact}
-
-
-@cache
-def this_commit() -> str:
-    """The commit of the code that is running, and whether files differ from it; "unknown" for an installed copy."""
-    commit = _git("rev-parse", "HEAD")
-    if not commit:
-        return "unknown"
-    return f"{commit} with local changes" if _git("status", "--porcelain", "--untracked-files=no") else commit
 
 
 def moment(milliseconds: float) -> str:
@@ -194,33 +170,3 @@ def _version(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return ""
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
-    with suppress(OSError, subprocess.SubprocessError):
-        return subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=10
-        ).stdout.strip()
-    return ""
-
-
-def _processor() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _gpus() -> str:
-    import torch
-
-    if not torch.cuda.is_available():
-        return ""
-    names = [torch.cuda.get_device_name(place) for place in range(torch.cuda.device_count())]
-    return ", ".join(f"{names.count(name)} x {name}" for name in dict.fromkeys(names))

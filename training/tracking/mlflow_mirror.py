@@ -27,6 +27,7 @@ from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
 from training.tracking.mlflow_store import prepare_store
 from training.tracking.record import ALIAS, EXPERIMENT, Record, Server, find_records, parent_of, read_record
+from training.tracking.threads import background
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
@@ -365,36 +366,41 @@ def _signature() -> Any:
 
 
 class Mirror:
-    """Publishes in the background while a workflow runs; an outage is said once, and made up for later."""
+    """Publishes in the background while the block runs; an outage is reported once, and made up for later.
+
+    Parameters
+    ----------
+    root
+        The folder whose records are published.
+    every, after_failure
+        Seconds between publications, and before the next one after an outage.
+    """
 
     def __init__(self, root: Path, server: Server, *, every: float = 5.0, after_failure: float = 30.0) -> None:
-        """``every``: seconds between publications, ``after_failure``: before the next one after an outage."""
         self._root, self._server, self._every, self._after_failure = root, server, every, after_failure
-        self._stop = threading.Event()
         self._failed: TrackingError | None = None
-        self._on = False
-        self._thread = threading.Thread(target=self._follow, name="mlflow-mirror", daemon=True)
-
-    def start(self) -> None:
-        """Begin, unless MLflow is not installed here: then records wait for a machine that has it."""
         self._on = importlib.util.find_spec("mlflow") is not None
+        self._background = background(self._follow, name="mlflow-mirror")
+
+    def __enter__(self) -> "Mirror":
         if self._on:
-            self._thread.start()
-        else:
+            self._background.__enter__()
+        else:  # records wait for a machine that has it
             log.warning("MLflow is not installed here, so nothing is sent. Later: %s", _how_to_sync(self._root, None))
+        return self
 
-    def close(self) -> TrackingError | None:
-        """Stop, publish once more, and return what went wrong if that did not work."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Publish once more; where that fails, raise its TrackingError, unless the block has failed already."""
         if not self._on:
-            return None
-        self._stop.set()
-        self._thread.join()
+            return
+        self._background.__exit__(None, None, None)
         self._publish()
-        return self._failed
+        if self._failed and kind is None:
+            raise self._failed
 
-    def _follow(self) -> None:
+    def _follow(self, stop: threading.Event) -> None:
         pause = 0.1
-        while not self._stop.wait(pause):
+        while not stop.wait(pause):
             self._publish()
             pause = self._every if self._failed is None else self._after_failure
 

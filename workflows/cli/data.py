@@ -4,33 +4,31 @@ import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from datagen.bodies.imported_layouts import Layout
-from datagen.bodies.standins.smpl_format import Kind
 from datagen.common.errors import DatasetError, RecipeError
 from datagen.common.printable import printable
-from datagen.exporters import ExportLayout
-from datagen.recipe import PATH_KEYS, AnnyTopology, DatasetRecipe
-from workflows.cli.declare import Command, add_command
-from workflows.pipeline.console import (
+from workflows.cli.declare import (
+    Command,
+    Parser,
     add_local_option,
     add_recipe_options,
     add_set_option,
     add_yes_option,
-    print_facts,
-    print_text,
 )
-from workflows.recipe.loader import change_recipe, load_recipe, override_values, recipe_faults, with_absolute_paths
+from workflows.pipeline.console import print_facts, print_text
+
+if TYPE_CHECKING:
+    from datagen.recipe import DatasetRecipe
 
 
-def declare_generate(made: argparse.ArgumentParser) -> None:
+def declare_generate(made: Parser) -> None:
     add_recipe_options(made)
     _add_making(made)
     made.add_argument("--fresh", action="store_true", help="remove what is there first")
 
 
-def declare_append(made: argparse.ArgumentParser) -> None:
+def declare_append(made: Parser) -> None:
     made.add_argument("out", metavar="X.zarr", help="a complete dataset")
     for name, what in (
         ("training", "training identities"),
@@ -44,18 +42,20 @@ def declare_append(made: argparse.ArgumentParser) -> None:
     add_set_option(made)
 
 
-def declare_inspect(made: argparse.ArgumentParser) -> None:
+def declare_inspect(made: Parser) -> None:
     made.add_argument("dataset", metavar="X.zarr")
     made.add_argument("--picture", metavar="PNG", help="where the picture goes; none: no picture")
 
 
-def declare_verify(made: argparse.ArgumentParser) -> None:
+def declare_verify(made: Parser) -> None:
     made.add_argument("dataset", metavar="X.zarr")
     made.add_argument("--repair", action="store_true", help="make faulty or missing shards again")
     add_set_option(made)
 
 
-def declare_import(made: argparse.ArgumentParser) -> None:
+def declare_import(made: Parser) -> None:
+    from datagen.bodies.imported_layouts import Layout
+
     made.add_argument("layout", choices=get_args(Layout), help="how the files lie (docs/importing.md)")
     made.add_argument("folder", metavar="FOLDER", help="where they are")
     _add_making(made)
@@ -63,7 +63,9 @@ def declare_import(made: argparse.ArgumentParser) -> None:
     add_set_option(made)
 
 
-def declare_export(made: argparse.ArgumentParser) -> None:
+def declare_export(made: Parser) -> None:
+    from datagen.exporters import ExportLayout
+
     made.add_argument("dataset", metavar="X.zarr")
     made.add_argument("--layout", choices=get_args(ExportLayout), required=True, help="see docs/importing.md")
     made.add_argument("--out", required=True, metavar="FOLDER", help="where the files go")
@@ -73,12 +75,15 @@ def declare_export(made: argparse.ArgumentParser) -> None:
     made.add_argument("--fresh", action="store_true", help="write files anew that are there")
 
 
-def declare_convert(made: argparse.ArgumentParser) -> None:
+def declare_convert(made: Parser) -> None:
     made.add_argument("model", metavar="MODEL", help="the file that came with your licence (.pkl or .npz)")
     made.add_argument("--out", required=True, metavar="X.npz", help="where the arrays go")
 
 
-def declare_stand_in(made: argparse.ArgumentParser) -> None:
+def declare_stand_in(made: Parser) -> None:
+    from datagen.bodies.standins.smpl_format import Kind
+    from datagen.recipe import AnnyTopology
+
     made.add_argument("kind", choices=get_args(Kind), help="whose layout")
     made.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
     made.add_argument(
@@ -89,7 +94,7 @@ def declare_stand_in(made: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_making(parser: argparse.ArgumentParser) -> None:
+def _add_making(parser: Parser) -> None:
     parser.add_argument("--out", required=True, metavar="X.zarr", help="where the dataset goes (folder or store URL)")
     add_local_option(parser)
     add_yes_option(parser)
@@ -98,6 +103,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
 def generate_command(options: argparse.Namespace) -> None:
     """Make a dataset, or what is missing of one."""
     from datagen.generate import generate
+    from workflows.recipe.loader import load_recipe
 
     recipe = load_recipe(options.recipe, options.set).data
     with _runner(options, recipe, anew=options.fresh) as how:
@@ -123,7 +129,8 @@ def inspect_command(options: argparse.Namespace) -> None:
     """Show what a dataset holds, at any status, and draw identities x poses."""
     from datagen.store import open_dataset
     from datagen.store.verify import describe
-    from workflows.pipeline.stage_functions import draw_contact_sheet, is_complete
+    from training.reports.contact_sheet import draw_contact_sheet
+    from workflows.pipeline.generate import is_complete
 
     print_facts(describe(options.dataset))
     if options.picture != "none" and is_complete(options.dataset):
@@ -137,8 +144,8 @@ def verify_command(options: argparse.Namespace) -> None:
     from datagen.generate import inline, repair
     from datagen.grid import Grid
     from datagen.store.verify import find_faults
+    from workflows.pipeline.generate import generation_bar, is_complete
     from workflows.pipeline.progress import bar
-    from workflows.pipeline.stage_functions import generation_bar, is_complete
 
     recipe = _own_recipe(options.dataset, options.set)
     count = Grid(recipe).shard_count
@@ -158,7 +165,7 @@ def verify_command(options: argparse.Namespace) -> None:
     print_text(f"{options.dataset} is whole again")
 
 
-def _own_recipe(url: str, overrides: Sequence[str]) -> DatasetRecipe:
+def _own_recipe(url: str, overrides: Sequence[str]) -> "DatasetRecipe":
     """The recipe stored with a dataset, with other paths of asset files.
 
     Raises
@@ -166,7 +173,9 @@ def _own_recipe(url: str, overrides: Sequence[str]) -> DatasetRecipe:
     RecipeError
         Something else than a path is changed.
     """
+    from datagen.recipe import PATH_KEYS
     from datagen.store.verify import require_recipe
+    from workflows.recipe.loader import change_recipe
 
     stored = require_recipe(url)
     recipe = change_recipe({"data": stored.model_dump(mode="json")}, overrides, where=url).data
@@ -179,6 +188,7 @@ def import_command(options: argparse.Namespace) -> None:
     """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset."""
     from datagen.generate import generate
     from datagen.importers import found_recipe
+    from workflows.recipe.loader import change_recipe, recipe_faults
 
     of_body = _body_options(options.set)
     with recipe_faults(f"import {options.layout}"):
@@ -192,6 +202,8 @@ def import_command(options: argparse.Namespace) -> None:
 
 def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
     """What ``--set data.body.*`` says: it decides which files are found."""
+    from workflows.recipe.loader import override_values, with_absolute_paths
+
     section: Any = override_values(overrides)
     for name in ("data", "body"):
         section = section.get(name, {})
@@ -240,11 +252,11 @@ def stand_in_command(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _runner(options: argparse.Namespace, recipe: DatasetRecipe, *, anew: bool) -> Iterator[dict[str, Any]]:
+def _runner(options: argparse.Namespace, recipe: "DatasetRecipe", *, anew: bool) -> Iterator[dict[str, Any]]:
     """Where tasks run (here or on Ray, by their size) and what shows their progress, once there is room for all."""
     from workflows.pipeline.data_size import announce_size
+    from workflows.pipeline.generate import generation_bar
     from workflows.pipeline.ray_cluster import require_reachable
-    from workflows.pipeline.stage_functions import generation_bar
     from workflows.pipeline.tasks import TaskRunner
 
     options.out = require_reachable(options.out, option="--out", urls=True)
@@ -259,45 +271,62 @@ def _show(url: str) -> None:
     print_facts(describe(url))
 
 
-_EXAMPLES: dict[Command, str] = {
-    generate_command: """\
+COMMANDS = (
+    Command(
+        generate_command,
+        declare_generate,
+        """\
   dsffnet generate --recipe quickstart --out data/quickstart.zarr
   dsffnet generate --recipe quickstart --set data.identities.seed=7 --out data/custom.zarr
   dsffnet generate --recipe data/custom.zarr --out data/custom-again.zarr""",
-    append_command: """\
+        takes_recipe=True,
+    ),
+    Command(
+        append_command,
+        declare_append,
+        """\
   dsffnet append data/quickstart.zarr --training 24
   dsffnet append data/quickstart.zarr --evaluation 12 --unseen 400""",
-    inspect_command: """\
+    ),
+    Command(
+        inspect_command,
+        declare_inspect,
+        """\
   dsffnet inspect data/quickstart.zarr
   dsffnet inspect data/quickstart.zarr --picture sheet.png""",
-    import_command: """\
-  dsffnet import faust FAUST/training/registrations --out data/faust.zarr
-  dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
-    convert_body_command: """\
-  dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz""",
-    stand_in_command: """\
-  dsffnet stand-in smpl --out standin.npz
-  dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr""",
-    export_command: """\
-  dsffnet export data/quickstart.zarr --layout npt-obj --out exported
-  dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
-    verify_command: """\
+    ),
+    Command(
+        verify_command,
+        declare_verify,
+        """\
   dsffnet verify data/quickstart.zarr
   dsffnet verify data/quickstart.zarr --repair""",
-}
-
-
-def add_data_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare them all."""
-
-    def declared(command: Command, **options: bool) -> argparse.ArgumentParser:
-        return add_command(commands, command, _EXAMPLES[command], **options)
-
-    declare_generate(declared(generate_command, takes_recipe=True))
-    declare_append(declared(append_command))
-    declare_inspect(declared(inspect_command))
-    declare_verify(declared(verify_command))
-    declare_import(declared(import_command))
-    declare_export(declared(export_command))
-    declare_convert(declared(convert_body_command))
-    declare_stand_in(declared(stand_in_command))
+    ),
+    Command(
+        import_command,
+        declare_import,
+        """\
+  dsffnet import faust FAUST/training/registrations --out data/faust.zarr
+  dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
+    ),
+    Command(
+        export_command,
+        declare_export,
+        """\
+  dsffnet export data/quickstart.zarr --layout npt-obj --out exported
+  dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
+    ),
+    Command(
+        convert_body_command,
+        declare_convert,
+        """\
+  dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz""",
+    ),
+    Command(
+        stand_in_command,
+        declare_stand_in,
+        """\
+  dsffnet stand-in smpl --out standin.npz
+  dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr""",
+    ),
+)

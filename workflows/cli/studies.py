@@ -3,120 +3,145 @@
 import argparse
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
 
 from datagen.common.errors import RecipeError
 from datagen.common.files import read_text_within
-from training.tracking.mlflow_mirror import Mirror
-from training.tracking.record import EXPERIMENT
-from workflows.cli.declare import Command, add_command
-from workflows.comparison.plan import Kind, known_comparisons, plan_comparison
-from workflows.comparison.run import OWN, run_comparison
-from workflows.comparison.run import Settings as ComparisonSettings
-from workflows.pipeline.console import (
+from training.tracking.record import EXPERIMENT, Server
+from workflows.cli.declare import (
+    Command,
+    Parser,
+    add_checkpoint_option,
+    add_fresh_option,
     add_recipe_options,
     add_set_option,
     add_tracking_option,
     add_yes_option,
-    alone_in,
-    print_text,
-    server_of,
 )
-from workflows.pipeline.data_size import announce_size
-from workflows.pipeline.ray_cluster import require_reachable
-from workflows.studies.generalisation import EXAMPLES as GENERALISATION_EXAMPLES
-from workflows.studies.generalisation import add_generalisation_options, generalisation_command
-from workflows.studies.robustness import EXAMPLES as ROBUSTNESS_EXAMPLES
-from workflows.studies.robustness import add_robustness_options, robustness_command
-from workflows.sweep.plan import known_sweeps, plan_sweep
-from workflows.sweep.report import Result, best_of, parse_levels
-from workflows.sweep.run import Settings, remove_sweep, run_sweep
+from workflows.pipeline.console import print_text, server_of
 
-_SCRIPTS: dict[Kind, str] = {"comparison": "compare", "ablation": "ablation"}
+if TYPE_CHECKING:
+    from datagen.recipe import DatasetRecipe
+    from workflows.pipeline.run_folder import TrialsFolder
+    from workflows.sweep.report import Result
+
+Kind = Literal["comparison", "ablation"]
+_NAMES: dict[Kind, str] = {"comparison": "compare", "ablation": "ablation"}
 
 
-def add_comparison_options(made: argparse.ArgumentParser, kind: Kind) -> None:
-    """Options of a comparison of methods, or of the ablations."""
+def _trials_options(made: Parser, one: str) -> None:
+    """What all commands that train many take; ``one`` of them is called so."""
     add = made.add_argument
-    names = ", ".join(known_comparisons(kind))
-    add("--recipe", default="small", metavar="NAME|FILE", help=f"a YAML file, or one of {names} (default small)")
-    add_set_option(made)
-    add("--out", metavar="DIR", help=f"folder for everything (default runs/{_SCRIPTS[kind]}-RECIPE)")
-    add("--cpus-per-trial", type=int, default=1, metavar="N", help="CPUs, and threads, of each training (default 1)")
+    add("--cpus-per-trial", type=int, default=1, metavar="N", help=f"CPUs, and threads, of each {one} (default 1)")
     add(
         "--gpus-per-trial", type=float, default=0.0, metavar="N",
-        help="GPUs of each training; a fraction lets several share one (default 0: trainings keep to their CPUs)",
+        help=f"GPUs of each {one}; a fraction lets several share one (default 0: {one}s keep to their CPUs)",
     )  # fmt: skip
     add_tracking_option(made)
-    add("--fresh", action="store_true", help="remove what DIR holds of this and start over")
+    add_fresh_option(made, "what DIR holds of this")
     add_yes_option(made)
 
 
-def compare_command(options: argparse.Namespace) -> None:
-    """Train DSFFNet, NPT and 3D-CoreNet under one budget on one dataset: Tables 1 and 2, Figure 4, a report."""
-    _run(options, "comparison")
+@contextmanager
+def _at_work(options: argparse.Namespace, folder: "TrialsFolder", data: "DatasetRecipe") -> Iterator[Server]:
+    """Hold a folder of trials, started over where that is asked, and mirror it to MLflow while the block runs."""
+    from training.tracking.mlflow_mirror import Mirror
+    from workflows.pipeline.data_size import announce_size
 
-
-def ablation_command(options: argparse.Namespace) -> None:
-    """Train DSFFNet and its ablations under one budget on one dataset: Table 3, its figure, a report."""
-    _run(options, "ablation")
-
-
-def _run(options: argparse.Namespace, kind: Kind) -> None:
-    comparison = plan_comparison(options.recipe, options.set, kind=kind)
     if options.cpus_per_trial < 1 or options.gpus_per_trial < 0:
         raise RecipeError(
             f"--cpus-per-trial {options.cpus_per_trial} and --gpus-per-trial {options.gpus_per_trial:g}: a training "
             "needs one CPU or more, and no less than no GPU"
         )
-    out = Path(require_reachable(options.out or f"runs/{_SCRIPTS[kind]}-{comparison.name}", option="--out"))
-    announce_size(comparison.recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
-    server = server_of(out, options.tracking_uri)
-    mirror = Mirror(out, server)
-    with alone_in(out):
+    announce_size(data, folder.data, anew=options.fresh, yes=options.yes)
+    server = server_of(folder.path, options.tracking_uri)
+    with folder.alone():
         if options.fresh:
-            remove_sweep(out, kind=kind, own=OWN)
-        mirror.start()
-        try:
-            settings = ComparisonSettings(options.cpus_per_trial, options.gpus_per_trial)
-            run_comparison(comparison, out, settings, command=_command_line(options, kind))
-        finally:
-            outage = mirror.close()
-    print_text(comparison_closing_words(out, f"{server.uri}, experiment {EXPERIMENT!r}"))
-    if outage:
-        raise outage
+            folder.remove()
+        with Mirror(folder.path, server):
+            yield server
+
+
+def _where(out: Path, server: Server, places: dict[str, str]) -> list[str]:
+    """Lines that say where everything lies, below ``out`` as a person would write it."""
+    shown = _shown(out)
+    lines = [f"  {name:12}  {shown}/{place}" for name, place in places.items()]
+    return ["Where everything lies", *lines, f"  MLflow        {server.uri}, experiment {EXPERIMENT!r}"]
+
+
+def _shown(out: Path) -> Path:
+    return Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
+
+
+def _compare_options(made: Parser) -> None:
+    _comparison_options(made, "comparison")
+
+
+def _ablation_options(made: Parser) -> None:
+    _comparison_options(made, "ablation")
+
+
+def _comparison_options(made: Parser, kind: Kind) -> None:
+    from workflows.comparison.plan import known_comparisons
+
+    add, names = made.add_argument, ", ".join(known_comparisons(kind))
+    add("--recipe", default="small", metavar="NAME|FILE", help=f"a YAML file, or one of {names} (default small)")
+    add_set_option(made)
+    add("--out", metavar="DIR", help=f"folder for everything (default runs/{_NAMES[kind]}-RECIPE)")
+    _trials_options(made, "training")
+
+
+def compare_command(options: argparse.Namespace) -> None:
+    """Train DSFFNet, NPT and 3D-CoreNet under one budget on one dataset: Tables 1 and 2, Figure 4, a report."""
+    _compare(options, "comparison")
+
+
+def ablation_command(options: argparse.Namespace) -> None:
+    """Train DSFFNet and its ablations under one budget on one dataset: Table 3, its figure, a report."""
+    _compare(options, "ablation")
+
+
+def _compare(options: argparse.Namespace, kind: Kind) -> None:
+    from workflows.comparison.plan import plan_comparison
+    from workflows.comparison.run import folder_of, run_comparison
+    from workflows.pipeline.ray_cluster import require_reachable
+
+    plan = plan_comparison(options.recipe, options.set, kind=kind)
+    out = Path(require_reachable(options.out or f"runs/{_NAMES[kind]}-{plan.name}", option="--out"))
+    with _at_work(options, folder_of(plan, out), plan.recipe.data) as server:
+        cpus, gpus = options.cpus_per_trial, options.gpus_per_trial
+        run_comparison(plan, out, cpus=cpus, gpus=gpus, command=_command_line(options, kind))
+        print_text(_comparison_words(out, server))
 
 
 def _command_line(options: argparse.Namespace, kind: Kind) -> str:
     """The command that does the same again."""
-    words = ["python", f"workflows/{_SCRIPTS[kind]}.py", "--recipe", options.recipe]
+    words = ["dsffnet", _NAMES[kind], "--recipe", options.recipe]
     words += ["--set", *options.set] if options.set else []
     words += ["--cpus-per-trial", str(options.cpus_per_trial)] if options.cpus_per_trial != 1 else []
     words += ["--gpus-per-trial", f"{options.gpus_per_trial:g}"] if options.gpus_per_trial else []
-    return " ".join(map(shlex.quote, words))
+    return shlex.join(words)
 
 
-def comparison_closing_words(out: Path, tracking: str) -> str:
+def _comparison_words(out: Path, server: Server) -> str:
     """The tables, and where everything lies."""
-    shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-    return "\n".join(
-        [
-            read_text_within(out, "evaluation/tables.md"),
-            "Where everything lies",
-            f"  report        {shown}/report.html, report.md",
-            f"  pictures      {shown}/evaluation/figures",
-            f"  viewer        {shown}/evaluation/viewer.html  (turn and zoom; open it in a browser)",
-            f"  rows          {shown}/evaluation/rows.csv",
-            f"  runs          {shown}/trials/METHOD",
-            f"  dataset       {shown}/dataset.zarr",
-            f"  MLflow        {tracking}",
-        ]
-    )
+    places = {
+        "report": "report.html, report.md",
+        "pictures": "evaluation/figures",
+        "viewer": "evaluation/viewer.html  (turn and zoom; open it in a browser)",
+        "rows": "evaluation/rows.csv",
+        "runs": "trials/METHOD",
+        "dataset": "dataset.zarr",
+    }
+    return "\n".join([read_text_within(out, "evaluation/tables.md"), *_where(out, server, places)])
 
 
-def add_sweep_options(made: argparse.ArgumentParser) -> None:
-    """Options of a sweep."""
+def _sweep_options(made: Parser) -> None:
+    from workflows.sweep.plan import known_sweeps
+
     add_recipe_options(made)
     made.set_defaults(recipe=None)
     add = made.add_argument
@@ -128,69 +153,43 @@ def add_sweep_options(made: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     sweeps = ", ".join(known_sweeps())
     add("--trials", metavar="NAME|FILE", help=f"a YAML list of trials {{name, description, set}}, or one of {sweeps}")
-    add("--cpus-per-trial", type=int, default=1, metavar="N", help="CPUs, and threads, of each trial (default 1)")
-    add(
-        "--gpus-per-trial", type=float, default=0.0, metavar="N",
-        help="GPUs of each trial; a fraction lets several share one (default 0: trials keep to their CPUs)",
-    )  # fmt: skip
     add(
         "--reach", nargs="+", default=["2x"], metavar="LEVEL",
-        help="PMD whose first reaching is told: 2x for twice the best final one (default), 40 for 40e-4",
+        help="PMD whose first reaching is reported: 2x for twice the best final one (default), 40 for 40e-4",
     )  # fmt: skip
     add("--strict", action="store_true", help="exit status 1 if any trial failed, not only if all did")
-    add_tracking_option(made)
-    add("--fresh", action="store_true", help="remove what DIR holds of this sweep and start over")
-    add_yes_option(made)
+    _trials_options(made, "trial")
 
 
 def sweep_command(options: argparse.Namespace) -> None:
-    """Train many recipes on one dataset, and say which learned best."""
+    """Train many recipes on one dataset, and report which learned best."""
+    from workflows.pipeline.ray_cluster import require_reachable
+    from workflows.pipeline.run_folder import SweepFolder
+    from workflows.sweep.plan import plan_sweep
+    from workflows.sweep.report import parse_levels
+    from workflows.sweep.run import Settings, run_sweep
+
     sweep = plan_sweep(recipe=options.recipe, shared=options.set, vary=options.vary, trials=options.trials)
-    if options.cpus_per_trial < 1 or options.gpus_per_trial < 0:
-        raise RecipeError(
-            f"--cpus-per-trial {options.cpus_per_trial} and --gpus-per-trial {options.gpus_per_trial:g}: a trial needs "
-            "one CPU or more, and no less than no GPU"
-        )
     name = options.name or (Path(options.trials).stem if options.trials else "sweep")
-    settings = Settings(
-        name, parse_levels(options.reach), options.cpus_per_trial, options.gpus_per_trial, options.strict
-    )
+    levels = parse_levels(options.reach)
+    settings = Settings(name, levels, options.cpus_per_trial, options.gpus_per_trial, options.strict)
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
-    announce_size(sweep.recipe.data, str(out / "dataset.zarr"), anew=options.fresh, yes=options.yes)
-    server = server_of(out, options.tracking_uri)
-    mirror = Mirror(out, server)
-
-    def show(results: list[Result]) -> None:
-        print_text(sweep_closing_words(results, out, f"{server.uri}, experiment {EXPERIMENT!r}"))
-
-    with alone_in(out):
-        if options.fresh:
-            remove_sweep(out)
-        mirror.start()
-        try:
-            run_sweep(sweep, out, settings, show=show)
-        finally:
-            outage = mirror.close()
-    if outage:
-        raise outage
+    with _at_work(options, SweepFolder(out), sweep.recipe.data) as server:
+        run_sweep(sweep, out, settings, show=lambda results: print_text(_sweep_words(results, out, server)))
 
 
-def sweep_closing_words(results: Sequence[Result], out: Path, tracking: str) -> str:
+def _sweep_words(results: "list[Result]", out: Path, server: Server) -> str:
     """The table, where everything lies, and how to go on with the best trial."""
-    shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-    words = [
-        read_text_within(out, "sweep.md"),
-        "Where everything lies",
-        f"  table         {shown}/sweep.md, sweep.csv",
-        *([f"  figure        {shown}/figures/sweep.png"] if (out / "figures" / "sweep.png").exists() else []),
-        f"  runs          {shown}/trials/NAME",
-        f"  dataset       {shown}/dataset.zarr",
-        f"  MLflow        {tracking}",
-    ]
-    best = best_of(results)
+    from workflows.sweep.report import best_of
+
+    figure = {"figure": "figures/sweep.png"} if (out / "figures" / "sweep.png").exists() else {}
+    places = {"table": "sweep.md, sweep.csv", **figure, "runs": "trials/NAME", "dataset": "dataset.zarr"}
+    words, best = [read_text_within(out, "sweep.md"), *_where(out, server, places)], best_of(results)
     if best is not None:
-        run, data = shlex.quote(str(best.trial.folder(shown))), shlex.quote(str(shown / "dataset.zarr"))
-        recipe = shlex.quote(str(shown / "best.yaml"))
+        run, data, recipe = (
+            shlex.quote(str(path))
+            for path in (best.trial.folder(_shown(out)), _shown(out) / "dataset.zarr", _shown(out) / "best.yaml")
+        )
         words += [
             "",
             f"Go on with the best, {best.trial.name}",
@@ -200,20 +199,96 @@ def sweep_closing_words(results: Sequence[Result], out: Path, tracking: str) -> 
     return "\n".join(words)
 
 
-_EXAMPLES: dict[Command, str] = {
-    sweep_command: "  dsffnet sweep --trials networks --out runs/networks",
-    compare_command: """\
+def _weights_options(made: Parser) -> None:
+    made.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folders of trainings, a workflow's, checkpoints or weights"
+    )
+    add_checkpoint_option(made)
+    made.add_argument("--out", metavar="FOLDER", help="where results go (default: below the run, or runs/ for several)")
+
+
+def _robustness_options(made: Parser) -> None:
+    from training.evaluation.disturbances import DISTURBANCES
+
+    _weights_options(made)
+    add, known = made.add_argument, ", ".join(its.name for its in DISTURBANCES)
+    add("--data", required=True, metavar="X.zarr", help="a complete dataset with evaluation triples")
+    add("--triples", type=int, default=40, metavar="N", help="evaluation triples (default 40)")
+    add("--only", nargs="+", metavar="NAME", help=f"some of {known}")
+    add("--emd-points", type=int, default=0, metavar="N", help="vertices of the earth mover's distance (default: none)")
+    add("--example", type=int, default=0, metavar="I", help="the triple in the pictures (default 0)")
+
+
+def robustness_command(options: argparse.Namespace) -> None:
+    """Disturb the source (noise, missing parts, other sampling, rotation) and measure what comes out."""
+    from workflows.studies.robustness import robustness_command as run
+
+    run(options)
+
+
+def _generalisation_options(made: Parser) -> None:
+    from datagen.recipe import AnnyTopology
+    from workflows.studies.sizes import OTHERS, TOPOLOGIES, Sizes
+
+    _weights_options(made)
+    sizes, add = Sizes(), made.add_argument
+    known = tuple(its for its in get_args(AnnyTopology) if its != "makehuman")
+    add(
+        "--topologies", nargs="+", choices=known, default=list(TOPOLOGIES), metavar="NAME",
+        help=f"Anny's meshes to make (default: all of {', '.join(TOPOLOGIES)})",
+    )  # fmt: skip
+    add(
+        "--others", nargs="*", choices=OTHERS, default=list(OTHERS), metavar="NAME",
+        help="smpl (the stand-in in SMPL's format), animals (the CC0 ones); nothing: neither (default: both)",
+    )  # fmt: skip
+    add("--data", nargs="+", default=[], metavar="X.zarr", help="datasets of your own: FAUST, MultiGarment, any")
+    add(
+        "--recipe", metavar="NAME|FILE|X.zarr",
+        help="whose people and poses (default: the first run's dataset, or quickstart)",
+    )  # fmt: skip
+    add("--identities", type=int, default=sizes.identities, metavar="N", help="new identities (default 4)")
+    add("--poses", type=int, default=sizes.poses, metavar="N", help="new poses (default 8)")
+    add("--triples", type=int, default=sizes.triples, metavar="N", help="transfers for each pair (default 16)")
+    add("--seed", type=int, default=sizes.seed, metavar="N", help="of people, poses, transfers (default 1000)")
+
+
+def generalisation_command(options: argparse.Namespace) -> None:
+    """Transfer between bodies and vertex counts that the weights were not trained on, and measure it."""
+    from workflows.studies.generalisation import generalisation_command as run
+
+    run(options)
+
+
+COMMANDS = (
+    Command(
+        sweep_command,
+        _sweep_options,
+        "  dsffnet sweep --trials networks --out runs/networks",
+        takes_recipe=True,
+    ),
+    Command(
+        compare_command,
+        _compare_options,
+        """\
   dsffnet compare --out runs/compare
   dsffnet compare --recipe animals-small --set training.steps=500""",
-    ablation_command: "  dsffnet ablation --out runs/ablation",
-}
-_COMPARED: dict[Command, Kind] = {compare_command: "comparison", ablation_command: "ablation"}
-
-
-def add_study_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare them and their options."""
-    add_sweep_options(add_command(commands, sweep_command, _EXAMPLES[sweep_command], takes_recipe=True))
-    for compared, kind in _COMPARED.items():
-        add_comparison_options(add_command(commands, compared, _EXAMPLES[compared], takes_recipe=True), kind)
-    add_robustness_options(add_command(commands, robustness_command, ROBUSTNESS_EXAMPLES))
-    add_generalisation_options(add_command(commands, generalisation_command, GENERALISATION_EXAMPLES))
+        takes_recipe=True,
+    ),
+    Command(ablation_command, _ablation_options, "  dsffnet ablation --out runs/ablation", takes_recipe=True),
+    Command(
+        robustness_command,
+        _robustness_options,
+        """\
+  dsffnet robustness runs/quickstart/run --data runs/quickstart/dataset.zarr
+  dsffnet robustness runs/dsffnet runs/npt runs/corenet3d --data X.zarr --out runs/robustness
+  dsffnet robustness RUN --data X.zarr --only noise patch --triples 100""",
+    ),
+    Command(
+        generalisation_command,
+        _generalisation_options,
+        """\
+  dsffnet generalisation runs/quickstart/run
+  dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
+  dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr""",
+    ),
+)

@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from datagen.common.errors import ClusterError
-from workflows.cli.declare import add_command
+from workflows.cli.declare import Command, Parser
 
 _LOOK_SECONDS = 2.0
 _LOST_SECONDS = 60.0  # without an answer of the cluster, or without the driver's node, until the job is given up
@@ -169,14 +169,7 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-_EXAMPLES = """\
-  dsffnet submit -- python workflows/full.py --out /shared/runs/quickstart
-  dsffnet submit --address http://HEAD:8265 -- dsffnet train --data /shared/x.zarr --out /shared/runs/first"""
-
-
-def add_submit(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare it and its options."""
-    made = add_command(commands, submit_command, _EXAMPLES)
+def _submit_options(made: Parser) -> None:
     made.add_argument("--address", metavar="URL", help="of the cluster's dashboard (default: RAY_API_SERVER_ADDRESS)")
     made.add_argument(
         "--working-dir",
@@ -185,3 +178,12 @@ def add_submit(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="whose files the job runs in a copy of, but for what .gitignore names (default: here)",
     )
     made.add_argument("entrypoint", nargs="+", metavar="COMMAND", help="behind --, e.g. -- python workflows/full.py")
+
+
+COMMAND = Command(
+    submit_command,
+    _submit_options,
+    """\
+  dsffnet submit -- python workflows/full.py --out /shared/runs/quickstart
+  dsffnet submit --address http://HEAD:8265 -- dsffnet train --data /shared/x.zarr --out /shared/runs/first""",
+)

@@ -10,32 +10,18 @@ from pathlib import Path
 from datagen.common.errors import RecipeError
 from datagen.common.printable import printable
 from datagen.common.resources import memory_errors
-from workflows.cli.declare import add_command
+from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.pipeline.console import print_text
-from workflows.pipeline.weights_argument import evaluated, which_checkpoint
 
-_EXAMPLES = """\
-  dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
-  dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
-  dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
-  dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine"""
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
 
-def add_transfer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare the command and its options."""
-    made = add_command(commands, transfer_command, _EXAMPLES)
+def _transfer_options(made: Parser) -> None:
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
     made.add_argument(
         "--model", required=True, metavar="RUN", help="run folder, weights, or models:/NAME@ALIAS (MLflow)"
     )
-    made.add_argument(
-        "--checkpoint",
-        type=which_checkpoint,
-        default="result",
-        metavar="result|latest|best|STEP",
-        help="which of the run's weights (result: the best where early stopping ended the run, else the latest)",
-    )
+    add_checkpoint_option(made)
     made.add_argument(
         "--source", metavar="A", help="mesh in the wanted pose, or a folder or pattern (w*.obj) of frames"
     )
@@ -48,13 +34,13 @@ def add_transfer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
 
 
-def _add_standing(made: argparse.ArgumentParser) -> None:
+def _add_standing(made: Parser) -> None:
     made.add_argument("--align", action="store_true", help="find by the network how each mesh stands, and turn it")
     made.add_argument("--up", metavar="AXIS", help="towards the head: X Y Z -X -Y -Z (Y), or two: SOURCE,TARGET")
     made.add_argument("--front", metavar="AXIS", help="where the body faces (Z), or two: SOURCE,TARGET")
 
 
-def _add_extras(made: argparse.ArgumentParser) -> None:
+def _add_extras(made: Parser) -> None:
     made.add_argument(
         "--refine", action="store_true", help="pull the edges back to the target's (see docs/transfer.md)"
     )
@@ -94,6 +80,8 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path]:
         MLflow does not have that model.
     """
     if not options.model.startswith("models:/"):
+        from workflows.pipeline.weights_argument import evaluated
+
         yield evaluated(Path(options.model), options.checkpoint).weights
         return
     from training.inference.registered_model import download_weights
@@ -118,3 +106,14 @@ def _rate(word: str) -> float:
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{word!r} is not a number above 0")
     return value
+
+
+COMMAND = Command(
+    transfer_command,
+    _transfer_options,
+    """\
+  dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
+  dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
+  dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
+  dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine""",
+)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from datagen.common.errors import DatasetError, DsffnetError
 from training.tracking.mlflow_store import prepare_store, sqlite_server
-from workflows.cli.declare import add_command
+from workflows.cli.declare import Command, Parser
 
 _LOOK_SECONDS = 0.3
 
@@ -82,15 +82,17 @@ def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
         keeper.wait()
 
 
-_EXAMPLES = """\
-  dsffnet ui
-  dsffnet ui runs/custom --port 5001"""
-
-
-def add_ui(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Declare it and its options."""
-    made = add_command(commands, ui_command, _EXAMPLES)
+def _ui_options(made: Parser) -> None:
     made.add_argument(
         "out", nargs="?", default="runs/quickstart", metavar="FOLDER", help="of a workflow (default: %(default)s)"
     )
     made.add_argument("--port", type=int, default=5000, help="of 127.0.0.1 (default: %(default)s)")
+
+
+COMMAND = Command(
+    ui_command,
+    _ui_options,
+    """\
+  dsffnet ui
+  dsffnet ui runs/custom --port 5001""",
+)

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from datagen.common.errors import DsffnetError
-from datagen.common.files import read_text_within, write_atomically
+from datagen.common.files import write_atomically
 from datagen.common.json_files import read_json
 from datagen.generate import ray_runner
 from datagen.store import Dataset
@@ -21,7 +21,6 @@ from training.evaluation.evaluate import (
     evaluate,
     evaluation_list,
     fingerprint_of,
-    read_rows,
     write_rows,
 )
 from training.evaluation.timing import Inference, measure_inference
@@ -30,11 +29,12 @@ from training.recipes.training import EvaluationRecipe
 from training.reports.examples import comparisons_of, draw_comparisons
 from training.reports.plots.ablation import ablation_figure
 from training.reports.plots.convergence import convergence_figure
-from training.tracking.record import update_record
 from workflows.comparison.plan import ComparisonPlan
 from workflows.comparison.tables import as_markdown, tables_of
+from workflows.pipeline.evaluate import end_evaluation, evaluation_bar, is_whole
 from workflows.pipeline.progress import sampling
-from workflows.pipeline.stage_functions import about_dataset, evaluation_bar, recorded, summary_metrics
+from workflows.pipeline.run_folder import ComparisonFolder, EvaluationFolder
+from workflows.pipeline.stage import recorded
 
 FOLDER = "evaluation"
 
@@ -44,15 +44,10 @@ def weights_of(runs: Mapping[str, Path]) -> dict[str, str]:
     return {name: fingerprint_of(require_checkpoint(run, "result")) for name, run in runs.items()}
 
 
-def intact(out: Path) -> bool:
+def intact(folder: EvaluationFolder) -> bool:
     """Whether the outputs of the evaluation are there, and those that are read again can be read."""
     try:
-        return (
-            (out / FOLDER / "viewer.html").is_file()
-            and bool(read_rows(out / FOLDER / "rows.csv"))
-            and bool(read_inference(out))
-            and bool(read_text_within(out / FOLDER, "tables.md"))
-        )
+        return is_whole(folder) and bool(read_inference(folder.path.parent))
     except (OSError, DsffnetError):
         return False
 
@@ -71,26 +66,25 @@ def read_inference(out: Path) -> dict[str, Inference]:
 _INFERENCE = TypeAdapter(dict[str, Inference])
 
 
-def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], out: Path) -> None:
+def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], out: ComparisonFolder) -> None:
     """Measure every method on the dataset's fixed triples, and show it."""
-    recipe, folder = plan.recipe.evaluation, out / FOLDER
-    about = recorded(folder, kind="evaluate", name="evaluate", parent=out, parameters=recipe.model_dump(mode="json"))
-    with about, sampling(folder / "system.jsonl"):
+    recipe, folder = plan.recipe.evaluation, out.evaluation
+    parameters = recipe.model_dump(mode="json")
+    with (
+        recorded(folder.path, kind="evaluate", name="evaluate", parent=out.path, parameters=parameters),
+        sampling(folder.load),
+    ):
         methods = [Method(name, str(require_checkpoint(run, "result").path)) for name, run in runs.items()]
-        rows = evaluate(methods, dataset.url, recipe, tasks=ray_runner, keep=folder / "chunks", progress=evaluation_bar)
-        write_rows(rows, folder / "rows.csv")
+        rows = evaluate(methods, dataset.url, recipe, tasks=ray_runner, keep=folder.chunks, progress=evaluation_bar)
+        write_rows(rows, folder.rows)
         inference = measure_inference(methods, vertices=_first_pair(dataset, recipe), threads=1)
         values = {name: asdict(its) for name, its in inference.items()}
-        write_atomically(folder / "inference.json", json.dumps(values, indent=1).encode())
+        write_atomically(folder.inference, json.dumps(values, indent=1).encode())
         text = as_markdown(plan, tables_of(plan, dataset, runs, rows, inference), plan.description)
-        write_atomically(folder / "tables.md", text.encode())
+        write_atomically(folder.tables, text.encode())
         _draw(plan, dataset, runs, rows, folder)
-        update_record(
-            folder,
-            dataset=about_dataset(dataset),
-            artifacts=["rows.csv", "tables.md", "viewer.html", "inference.json", "figures", "meshes"],
-            metrics=summary_metrics(rows),
-        )
+        artifacts = ["rows.csv", "tables.md", "viewer.html", "inference.json", "figures", "meshes"]
+        end_evaluation(folder, dataset, rows, artifacts)
 
 
 def _first_pair(dataset: Dataset, recipe: EvaluationRecipe) -> Batch:
@@ -98,11 +92,13 @@ def _first_pair(dataset: Dataset, recipe: EvaluationRecipe) -> Batch:
     return read_batch(dataset, next(triples for triples in lists if len(triples))[:1])
 
 
-def _draw(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], rows: list[Row], folder: Path) -> None:
+def _draw(
+    plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path], rows: list[Row], folder: EvaluationFolder
+) -> None:
     networks = {name: load_trained(run)[0] for name, run in runs.items()}
     examples = comparisons_of(dataset, networks, plan.recipe.evaluation, rows)
-    draw_comparisons(examples, folder, title=plan.title)
-    convergence_figure(runs, folder / "figures" / "convergence.png")
+    draw_comparisons(examples, folder.path, title=plan.title)
+    convergence_figure(runs, folder.figures / "convergence.png")
     if plan.kind == "ablation":
         trained = [row for name in plan.methods for row in rows if row.method == name]
-        ablation_figure(trained, folder / "figures" / "ablation.png")
+        ablation_figure(trained, folder.figures / "ablation.png")

@@ -15,7 +15,7 @@ from training.evaluation.timing import Inference
 from training.reports.card_texts import span, vertex_counts
 from training.tracking.journal import read_journal
 from workflows.comparison.plan import ComparisonPlan
-from workflows.pipeline.stage_functions import emd_points_of
+from workflows.pipeline.evaluate import emd_points_of
 
 
 def tables_of(

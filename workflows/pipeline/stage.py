@@ -1,9 +1,10 @@
-"""A stage has a fingerprint of what it depends on; one that was finished with the same fingerprint is skipped."""
+"""A stage of a workflow: skipped where it was finished with the same fingerprint, and recorded for MLflow otherwise."""
 
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ from typing import Any
 from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
-from datagen.common.errors import RecipeError
-from datagen.common.files import write_atomically
+from datagen.common.errors import TrainingStopped
+from datagen.common.files import refuse_links_out, write_atomically
 from datagen.common.json_files import read_json_if_whole
 from datagen.common.printable import printable
-from training.tracking.record import read_record
+from training.tracking.record import begin_record, end_record, flatten
 
 
 @dataclass(frozen=True)
@@ -51,19 +52,27 @@ def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
     return True
 
 
-def refuse_other_kind(out: Path, kind: str) -> None:
-    """Refuse a folder that another kind of work has its record in: that, its recipe and its report would be replaced.
+@contextmanager
+def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, parameters: dict[str, Any]) -> Iterator[None]:
+    """Keep a record in ``folder`` while the block runs, and end it as FINISHED, FAILED or KILLED.
 
     Raises
     ------
-    RecipeError
-        It is one.
+    UnsafeFileError
+        A link in the folder leads out of it: what is written there would go elsewhere.
     """
-    record = read_record(out)
-    if record and record.kind != kind:
-        raise RecipeError(
-            f"{out} is the folder of another kind of work: {record.kind} {record.name!r}. Choose another --out"
-        )
+    if parent:  # the outermost folder may hold links of its owner's, such as a dataset on another disk
+        refuse_links_out(folder)
+    begin_record(folder, name=name, kind=kind, parent=parent, parameters=flatten(parameters))
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, TrainingStopped):
+        end_record(folder, "KILLED")
+        raise
+    except BaseException:
+        end_record(folder, "FAILED")
+        raise
+    end_record(folder, "FINISHED")
 
 
 def once(work: Callable[[], None]) -> Callable[[], None]:

@@ -1,6 +1,5 @@
 """Which weights a person means by a path, and where their evaluation goes."""
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,6 @@ if TYPE_CHECKING:
     from datagen.store import Dataset
 
 _WEIGHTS = ".safetensors"
-_WORDS: dict[str, Which] = {"result": "result", "latest": "latest", "best": "best"}
 
 
 @dataclass(frozen=True)
@@ -58,15 +56,6 @@ def evaluated(place: Path, which: Which = "result") -> Evaluated:
         return Evaluated(checkpoint, place.parent if is_file else place, label)
     label = "" if which in ("result", "latest") else f"step-{checkpoint.step}"
     return Evaluated(checkpoint, checkpoint.path.parent.parent, label)
-
-
-def which_checkpoint(word: str) -> Which:
-    """``result``, ``latest``, ``best`` or a step, as it comes from a command line."""
-    if word in _WORDS:
-        return _WORDS[word]
-    if word.isdecimal():
-        return int(word)
-    raise argparse.ArgumentTypeError(f"{word!r} is none of result, latest, best, nor a step such as 2000")
 
 
 def _step_folder(place: Path) -> Path | None:

@@ -9,13 +9,11 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from datagen.bodies import FAMILIES
 from datagen.common.errors import RecipeError
-from datagen.poses import SOURCES
 from datagen.recipe import ANIMALS, DatasetRecipe, Frozen
 from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
 from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
-from training.recipes.training import DEFAULT_NETWORK, NETWORK_NAMES, EvaluationRecipe, TrainingRecipe
+from training.recipes.training import DEFAULT_NETWORK, EvaluationRecipe, TrainingRecipe
 from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
 from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
 
@@ -248,4 +246,15 @@ def _parts(annotation: Any) -> Iterator[Any]:
 
 _NO_SECTIONS = "is not a mapping of sections (data, training, evaluation), or is empty"
 _UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
-_MEMBERS = {*FAMILIES, *SOURCES, *NETWORK_NAMES}
+
+
+def _members(section: str, key: str) -> Iterator[str]:
+    """What the ``key`` of a section that has several kinds may say."""
+    *way, last = section.split(".")
+    model: Any = WorkflowRecipe
+    for name in way:
+        model = model.model_fields[name].annotation
+    yield from (kind.model_fields[key].default for kind in _parts(model.model_fields[last].annotation))
+
+
+_MEMBERS = {member for section, key, _ in _KINDS for member in _members(section, key)}

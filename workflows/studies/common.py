@@ -18,24 +18,10 @@ from training.evaluation.evaluate import fingerprint_of
 from training.evaluation.measure import LoadedMethod, load_methods
 from training.tracking.record import read_record, update_record
 from workflows.pipeline.ray_cluster import require_reachable
-from workflows.pipeline.weights_argument import Evaluated, evaluated, which_checkpoint
+from workflows.pipeline.stage import recorded
+from workflows.pipeline.weights_argument import Evaluated, evaluated
 
 _SETTINGS = "settings.json"
-
-
-def add_weights_options(made: argparse.ArgumentParser) -> None:
-    """RUN ..., --checkpoint and --out."""
-    made.add_argument(
-        "runs", nargs="+", metavar="RUN", help="run folders of trainings, a workflow's, checkpoints or weights"
-    )
-    made.add_argument(
-        "--checkpoint",
-        type=which_checkpoint,
-        default="result",
-        metavar="result|latest|best|STEP",
-        help="which of the runs' weights (result: the best where early stopping ended a run, else the latest)",
-    )
-    made.add_argument("--out", metavar="FOLDER", help="where results go (default: below the run, or runs/ for several)")
 
 
 def weights_of(options: argparse.Namespace) -> list[Evaluated]:
@@ -122,8 +108,6 @@ def study(
     folder: Path, name: str, weights: Sequence[Evaluated], settings: dict[str, Any], artifacts: Sequence[str]
 ) -> Iterator[dict[str, float]]:
     """Record a study while the block runs; the block fills the dictionary with the metrics to show."""
-    from workflows.pipeline.stage_functions import recorded
-
     metrics: dict[str, float] = {}
     with recorded(folder, kind="evaluate", name=name, parent=parent_of(weights), parameters=settings):
         yield metrics

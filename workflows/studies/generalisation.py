@@ -1,13 +1,13 @@
-"""Generalisation as a command: its options, its files, what it prints."""
+"""Generalisation as a command: its files, what it prints."""
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from datagen.common.errors import RecipeError
 from datagen.common.files import write_atomically
-from datagen.recipe import AnnyTopology, DatasetRecipe
+from datagen.recipe import DatasetRecipe
 from datagen.recipe.base import LARGEST
 from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.generalisation import (
@@ -32,7 +32,6 @@ from workflows.pipeline.weights_argument import Evaluated
 from workflows.recipe.loader import load_recipe
 from workflows.studies.common import (
     about_weights,
-    add_weights_options,
     folder_of,
     methods_of,
     same_settings,
@@ -40,39 +39,11 @@ from workflows.studies.common import (
     sync_words,
     weights_of,
 )
-from workflows.studies.mesh_kinds import OTHERS, TOPOLOGIES, Sizes, imported_kind, make_kinds, own_kind, own_recipe
+from workflows.studies.mesh_kinds import imported_kind, make_kinds, own_kind, own_recipe
+from workflows.studies.sizes import Sizes
 
 _FILES = ("generalisation.md", "rows.csv", "heat-map.png", "examples.png")
 _FIRST_RECIPE = "quickstart"
-
-EXAMPLES = """\
-  dsffnet generalisation runs/quickstart/run
-  dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
-  dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr"""
-
-
-def add_generalisation_options(made: argparse.ArgumentParser) -> None:
-    """Options of the study."""
-    add_weights_options(made)
-    sizes, add = Sizes(), made.add_argument
-    known = tuple(its for its in get_args(AnnyTopology) if its != "makehuman")
-    add(
-        "--topologies", nargs="+", choices=known, default=list(TOPOLOGIES), metavar="NAME",
-        help=f"Anny's meshes to make (default: all of {', '.join(TOPOLOGIES)})",
-    )  # fmt: skip
-    add(
-        "--others", nargs="*", choices=OTHERS, default=list(OTHERS), metavar="NAME",
-        help="smpl (the stand-in in SMPL's format), animals (the CC0 ones); nothing: neither (default: both)",
-    )  # fmt: skip
-    add("--data", nargs="+", default=[], metavar="X.zarr", help="datasets of your own: FAUST, MultiGarment, any")
-    add(
-        "--recipe", metavar="NAME|FILE|X.zarr",
-        help=f"whose people and poses (default: the first run's dataset, or {_FIRST_RECIPE})",
-    )  # fmt: skip
-    add("--identities", type=int, default=sizes.identities, metavar="N", help="new identities (default 4)")
-    add("--poses", type=int, default=sizes.poses, metavar="N", help="new poses (default 8)")
-    add("--triples", type=int, default=sizes.triples, metavar="N", help="transfers for each pair (default 16)")
-    add("--seed", type=int, default=sizes.seed, metavar="N", help="of people, poses, transfers (default 1000)")
 
 
 def generalisation_command(options: argparse.Namespace) -> None:

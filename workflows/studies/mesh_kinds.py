@@ -2,9 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from datagen.bodies.standins.smpl_format import write_standin
 from datagen.common.errors import DsffnetError
@@ -25,25 +23,10 @@ from datagen.recipe import (
 from datagen.store import Dataset, open_dataset
 from training.evaluation.generalisation import Kind
 from training.tracking.provenance import provenance_of
+from workflows.studies.sizes import Other, Sizes
 
-Other = Literal["smpl", "animals"]
-TOPOLOGIES: tuple[AnnyTopology, ...] = (
-    "notoes_collapse3pc", "notoes_collapse5pc", "notoes_collapse10pc", "notoes", "anny", "soma",
-)  # fmt: skip
-"""From 369 to 18,056 vertices."""
-OTHERS: tuple[Other, ...] = ("smpl", "animals")
 _CLIPS = ("attack*", "eating*", "gallop*", "idle*", "jump*", "walk*")  # all but dying, where animals lie
 _OF_HUMANS = ("npt", "ranges", "amass")  # poses over SMPL's joints, which all human bodies here take
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much of each kind is made, and the seed of its draws (another than the training's)."""
-
-    identities: int = 4
-    poses: int = 8
-    triples: int = 16
-    seed: int = 1000
 
 
 def own_recipe(home: Path) -> DatasetRecipe | None:

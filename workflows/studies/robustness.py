@@ -1,4 +1,4 @@
-"""Robustness as a command: its options, its files, what it prints."""
+"""Robustness as a command: its files, what it prints."""
 
 import argparse
 from collections.abc import Sequence
@@ -37,7 +37,6 @@ from workflows.pipeline.progress import bar
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.studies.common import (
     about_weights,
-    add_weights_options,
     folder_of,
     methods_of,
     same_settings,
@@ -48,23 +47,6 @@ from workflows.studies.common import (
 
 _FILES = ("robustness.md", "rows.csv", "curves.png", "noise.png", "disturbances.png")
 _KNOWN = tuple(its.name for its in DISTURBANCES)
-
-EXAMPLES = """\
-  dsffnet robustness runs/quickstart/run --data runs/quickstart/dataset.zarr
-  dsffnet robustness runs/dsffnet runs/npt runs/corenet3d --data X.zarr --out runs/robustness
-  dsffnet robustness RUN --data X.zarr --only noise patch --triples 100"""
-
-
-def add_robustness_options(made: argparse.ArgumentParser) -> None:
-    """Options of the study."""
-    add_weights_options(made)
-    made.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset with evaluation triples")
-    made.add_argument("--triples", type=int, default=40, metavar="N", help="evaluation triples (default 40)")
-    made.add_argument("--only", nargs="+", metavar="NAME", help=f"some of {', '.join(_KNOWN)}")
-    made.add_argument(
-        "--emd-points", type=int, default=0, metavar="N", help="vertices of the earth mover's distance (default: none)"
-    )
-    made.add_argument("--example", type=int, default=0, metavar="I", help="the triple in the pictures (default 0)")
 
 
 def robustness_command(options: argparse.Namespace) -> None:

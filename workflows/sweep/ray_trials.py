@@ -17,16 +17,12 @@ from typing import Any, Literal
 from datagen.common.errors import ClusterError, DsffnetError, TrainingError, TrainingStopped, WorkflowError
 from datagen.common.files import read_within, write_atomically
 from datagen.store import open_dataset
-from training.engine.distributed import STOP_FILE
-from training.engine.launch import launch
-from training.reports.examples import draw_training_curve
 from training.tracking.record import end_record, read_record, update_record
-from workflows.pipeline.console import alone_in
-from workflows.pipeline.stage import say
-from workflows.pipeline.stage_functions import about_dataset, check_run_accepts, is_trained, recorded, write_run_head
+from workflows.pipeline.run_folder import RunFolder, TrialsFolder
+from workflows.pipeline.stage import recorded, say
+from workflows.pipeline.train import HEAD, begin_run, check_run_accepts, is_trained, train_run
 from workflows.sweep.plan import Trial
 
-_MARK = ".sweep"
 _RETRIES = 3  # of a task whose worker or node died
 _STOPPING = 120.0  # seconds that told trials have for finishing their step and writing a checkpoint
 _FROM_PARENT = ("mlflow.user", "mlflow.source.name", "mlflow.source.type")
@@ -55,9 +51,9 @@ def prepare(trials: Sequence[Trial], *, data: str, out: Path) -> Place:
     """Mark the folder, and take back what an earlier command told these trials."""
     for trial in trials:
         trial.folder(out).mkdir(parents=True, exist_ok=True)
-        (trial.folder(out) / STOP_FILE).unlink(missing_ok=True)
+        RunFolder(trial.folder(out)).stop.unlink(missing_ok=True)
     mark = uuid.uuid4().hex
-    write_atomically(out / _MARK, mark.encode())
+    write_atomically(TrialsFolder(out).mark, mark.encode())
     return Place(data, out, mark)
 
 
@@ -71,7 +67,7 @@ def tell_to_stop(trials: Sequence[Trial], out: Path) -> None:
     """Ask trials to finish their step, write a checkpoint and end."""
     for trial in trials:
         with contextlib.suppress(OSError):
-            (trial.folder(out) / STOP_FILE).touch()
+            RunFolder(trial.folder(out)).stop.touch()
 
 
 def train_trial(trial: Trial, place: Place, *, tags: dict[str, str], threads: int) -> Outcome:
@@ -89,12 +85,12 @@ def train_trial(trial: Trial, place: Place, *, tags: dict[str, str], threads: in
     import torch
 
     torch.set_num_threads(threads)
-    run = trial.folder(place.out)
+    run = RunFolder(trial.folder(place.out))
     try:
         _require_shared_disk(place)
-        if (run / STOP_FILE).exists():
+        if run.stop.exists():
             raise TrainingStopped("told to stop before it began")
-        with alone_in(run, ".driver.lock"):
+        with run.alone():
             _train(trial, place, run, tags)
     except TrainingStopped as error:
         return Outcome(trial.name, "stopped", str(error), error.exit_status)
@@ -102,8 +98,8 @@ def train_trial(trial: Trial, place: Place, *, tags: dict[str, str], threads: in
         return Outcome(trial.name, "failed", str(error))
     except Exception as error:  # a mistake in one trial's network or recipe must not take the others with it
         with contextlib.suppress(OSError):
-            write_atomically(run / "failure.txt", traceback.format_exc().encode())
-        return Outcome(trial.name, "failed", f"{_in_a_line(error)} (traceback: {run / 'failure.txt'})")
+            write_atomically(run.traceback, traceback.format_exc().encode())
+        return Outcome(trial.name, "failed", f"{_in_a_line(error)} (traceback: {run.traceback})")
     return Outcome(trial.name, "finished")
 
 
@@ -149,25 +145,22 @@ def ray_trials(
             ray.wait(list(running), num_returns=len(running), timeout=_STOPPING)
 
 
-def _train(trial: Trial, place: Place, run: Path, tags: dict[str, str]) -> None:
+def _train(trial: Trial, place: Place, run: RunFolder, tags: dict[str, str]) -> None:
     recipe, dataset = trial.training, open_dataset(place.data)
-    check_run_accepts(recipe, dataset, run)
+    check_run_accepts(recipe, dataset, run.path)
     parameters = recipe.model_dump(mode="json")
-    with recorded(run, kind="train", name=trial.name, parent=place.out, parameters=parameters):
+    with recorded(run.path, kind="train", name=trial.name, parent=place.out, parameters=parameters):
         note = {"mlflow.note.content": trial.description or ", ".join(trial.words), "failure": "none"}
         tags = _inherited(place.out) | tags | note
-        artifacts = ["recipe.yaml", "provenance.json"]
-        update_record(run, tags=tags, dataset=about_dataset(dataset), artifacts=artifacts)
         try:
-            write_run_head(recipe, dataset, run)
-            launch(recipe, data=dataset.url, run=run)
-            draw_training_curve(run, run / "figures" / "training-curve.png", baselines={})
+            begin_run(recipe, dataset, run, tags=tags)
+            train_run(recipe, dataset, run)
         except TrainingStopped:
             raise
         except Exception as error:
-            update_record(run, tags=tags | {"failure": _in_a_line(error)})
+            update_record(run.path, tags=tags | {"failure": _in_a_line(error)})
             raise
-        update_record(run, artifacts=[*artifacts, "metrics.jsonl", "figures"])
+        update_record(run.path, artifacts=[*HEAD, "metrics.jsonl", "figures"])
 
 
 def _inherited(out: Path) -> dict[str, str]:
@@ -177,8 +170,8 @@ def _inherited(out: Path) -> dict[str, str]:
 
 
 def _require_shared_disk(place: Place) -> None:
-    mark = place.out / _MARK
-    if not mark.exists() or read_within(place.out, _MARK) != place.mark.encode():
+    mark = TrialsFolder(place.out).mark
+    if not mark.exists() or read_within(place.out, mark.name) != place.mark.encode():
         raise WorkflowError(f"this trial does not see {place.out} as the driver does: --out must be on a shared disk")
 
 

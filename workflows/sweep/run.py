@@ -1,41 +1,42 @@
-"""A sweep from start to end: the dataset once, every trial as a Ray task, the report; with MLflow watching."""
+"""Many trainings on one dataset, from start to end: what a sweep and a comparison share, and the sweep itself."""
 
-import shutil
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
-from datagen.common.errors import RecipeError, TrainingStopped, WorkflowError
+from datagen.common.errors import TrainingStopped, WorkflowError
 from datagen.common.files import read_text_within
 from datagen.store import open_dataset
-from datagen.store.attributes import check_same_recipe
-from datagen.store.schema import open_group
 from training.data.triples import last_step_of
 from training.evaluation.run_curves import PMD_UNIT
 from training.tracking.record import has_record, read_record, update_record
-from workflows.pipeline.console import start_over
+from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import ray_cluster
-from workflows.pipeline.stage import Stage, once, refuse_other_kind, run_stage, say
-from workflows.pipeline.stage_functions import check_run_accepts, generate_stage, is_complete, recorded
+from workflows.pipeline.run_folder import SweepFolder, TrialsFolder
+from workflows.pipeline.stage import once, recorded, run_stage, say
 from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import refuse_conflicts
 from workflows.recipe.loader import save_recipe
 from workflows.sweep.plan import Sweep, Trial, varied_values, write_sweep
 from workflows.sweep.progress import SweepProgress
 from workflows.sweep.ray_trials import Outcome, Place, is_finished, prepare, ray_trials
 from workflows.sweep.report import FILES, Result, best_of, results_of, write_report
 
-_OWN = ("trials", "trials.yaml", ".sweep", *FILES)
-
 Trials = Generator[Outcome | None, None, None]
 Runner = Callable[..., Trials]
 """Runs trials somewhere, see :func:`workflows.sweep.ray_trials.ray_trials`."""
+HEAD = ["recipe.yaml", "trials.yaml"]
+Made = TypeVar("Made")
+Finish = Callable[[list[Outcome], Callable[[], None]], Made]
+"""How the trials ended that ran now, and what to call before any work of its own -> what it makes of them."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a sweep is run and reported; nothing of it changes what is learned."""
+    """How trials are run and reported; nothing of it changes what is learned."""
 
     name: str
     levels: tuple[tuple[float, bool], ...] = ((2.0, True),)
@@ -44,89 +45,65 @@ class Settings:
     strict: bool = False
 
 
-def run_sweep(
-    sweep: Sweep,
-    out: Path,
-    settings: Settings,
-    *,
-    runner: Runner = ray_trials,
-    show: Callable[[list[Result]], None] = lambda results: None,
-) -> list[Result]:
-    """Dataset, trials and report into ``out``; what is finished is skipped, without so much as starting Ray.
+@dataclass(frozen=True)
+class Work:
+    """Trials in a folder, and what the record of the whole and of each trial hold beside them."""
 
-    Returns
-    -------
-    list of Result
-        Of all trials, the best first; ``show`` is given them before anything that failed is raised.
-
-    Raises
-    ------
-    WorkflowError, TrainingStopped
-        See :func:`judge`.
-    """
-    data = str(out / "dataset.zarr")
-    refuse_conflicts(sweep, data, out, kind="sweep")
-    with ExitStack() as around:
-        begin = once(lambda: _begin(around, sweep, out, settings))
-        outcomes = generate_and_train(
-            sweep,
-            out,
-            begin=begin,
-            running=partial(runner, tags=partial(_tags, sweep), cpus=settings.cpus, gpus=settings.gpus),
-            told=lambda: _report(sweep, out, settings),
-        )
-        if not has_record(out):
-            begin()
-            _report(sweep, out, settings)
-        results = results_of(sweep, out) if outcomes else _write_report(sweep, out, settings)
-        show(results)
-        judge(outcomes, of=len(sweep.trials), strict=settings.strict)
-    return results
+    sweep: Sweep
+    folder: TrialsFolder
+    settings: Settings
+    parameters: dict[str, str]
+    tags: Callable[[Trial], dict[str, str]]
 
 
-def generate_and_train(
-    sweep: Sweep,
-    out: Path,
-    *,
-    begin: Callable[[], None],
-    running: Runner,
-    told: Callable[[], None] = lambda: None,
-) -> list[Outcome]:
-    """Make the dataset, and train every trial that is not finished.
+def run_trials(work: Work, *, runner: Runner, finish: Finish[Made], told: Callable[[], None] = lambda: None) -> Made:
+    """Make the dataset, train every trial that is not finished, and ``finish`` what came out, in one record.
+
+    What is finished is skipped, without so much as starting Ray.
 
     Parameters
     ----------
-    sweep, out
+    work
         What to train, and where.
-    begin
-        Called before any work; not called if there is none.
-    running
+    runner
         Trials and their place -> a generator of how they end, see :func:`workflows.sweep.ray_trials.ray_trials`.
+    finish
+        See :data:`Finish`.
     told
         Called whenever a trial has ended.
-
-    Returns
-    -------
-    list of Outcome
-        Of the trials that ran now.
     """
-    data = str(out / "dataset.zarr")
-    generate = Stage(
-        "generate",
-        depends_on=sweep.recipe.data.model_dump(mode="json"),
-        intact=lambda: is_complete(data) and has_record(out / "generate"),
-        work=partial(generate_stage, sweep.recipe.data, data, folder=out / "generate", parent=out, tasks=TaskRunner()),
-    )
-    run_stage(generate, out=out, before=begin)
-    waiting = [trial for trial in sweep.trials if not is_finished(trial, data, out)]
-    if skipped := len(sweep.trials) - len(waiting):
-        say(f"trials: {skipped} of {len(sweep.trials)} skipped, finished before")
-    if not waiting:
-        return []
+    trials, folder = work.sweep.trials, work.folder
+    runs = {trial.folder(folder.path): trial.training for trial in trials}
+    refuse_conflicts(work.sweep.recipe.data, folder, runs)
+    with ExitStack() as around:
+        begin = once(lambda: _begin(around, work))
+        run_stage(generate_stage(work.sweep.recipe.data, folder, TaskRunner()), out=folder.path, before=begin)
+        waiting = [trial for trial in trials if not is_finished(trial, folder.data, folder.path)]
+        if skipped := len(trials) - len(waiting):
+            say(f"trials: {skipped} of {len(trials)} skipped, finished before")
+        return finish(_train(work, waiting, runner, begin, told) if waiting else [], begin)
+
+
+def _begin(around: ExitStack, work: Work) -> None:
+    """The resolved recipe and trials on disk, a parent record, a connected Ray."""
+    folder, recipe = work.folder, work.sweep.recipe
+    save_recipe(recipe, folder.recipe)
+    write_sweep(work.sweep, folder.plan)
+    parameters = recipe.model_dump(mode="json") | work.parameters
+    about = recorded(folder.path, kind=folder.kind, name=work.settings.name, parent=None, parameters=parameters)
+    around.enter_context(about)
+    update_record(folder.path, artifacts=HEAD)
+    around.enter_context(ray_cluster())
+
+
+def _train(
+    work: Work, waiting: Sequence[Trial], runner: Runner, begin: Callable[[], None], told: Callable[[], None]
+) -> list[Outcome]:
     begin()
     say(f"trials: {len(waiting)} begin")
-    place = prepare(waiting, data=data, out=out)
-    return _follow(sweep, place, running(waiting, place), told)
+    place = prepare(waiting, data=work.folder.data, out=work.folder.path)
+    running = runner(waiting, place, tags=work.tags, cpus=work.settings.cpus, gpus=work.settings.gpus)
+    return _follow(work.sweep, place, running, told)
 
 
 def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None]) -> list[Outcome]:
@@ -143,6 +120,48 @@ def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None
     return outcomes
 
 
+def run_sweep(
+    sweep: Sweep,
+    out: Path,
+    settings: Settings,
+    *,
+    runner: Runner = ray_trials,
+    show: Callable[[list[Result]], None] = lambda results: None,
+) -> list[Result]:
+    """Dataset, trials and report into ``out``.
+
+    Returns
+    -------
+    list of Result
+        Of all trials, the best first; ``show`` is given them before anything that failed is raised.
+
+    Raises
+    ------
+    WorkflowError, TrainingStopped
+        See :func:`judge`.
+    """
+    report = partial(_report, sweep, out, settings)
+
+    def finish(outcomes: list[Outcome], begin: Callable[[], None]) -> list[Result]:
+        if not has_record(out):
+            begin()
+            report()
+        results = results_of(sweep, out) if outcomes else _write_report(sweep, out, settings)
+        show(results)
+        judge(outcomes, of=len(sweep.trials), strict=settings.strict)
+        return results
+
+    values = {key: [varied_values(sweep, trial).get(key, "") for trial in sweep.trials] for key in sweep.varied}
+    varied = {f"varied.{key}": ", ".join(dict.fromkeys(found)) for key, found in values.items()}
+    parameters = {"trials": str(len(sweep.trials))} | varied
+    work = Work(sweep, SweepFolder(out), settings, parameters, partial(_tags, sweep))
+    return run_trials(work, runner=runner, finish=finish, told=report)
+
+
+def _tags(sweep: Sweep, trial: Trial) -> dict[str, str]:
+    return {f"varied.{key}": value for key, value in varied_values(sweep, trial).items()}
+
+
 def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     """Write the report, and give the parent record what a person wants to see first: table, figure, best trial."""
     results = _write_report(sweep, out, settings)
@@ -153,62 +172,12 @@ def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     if best is not None:
         metrics |= {"best_pmd_unseen": best.unseen.final / PMD_UNIT}
         tags |= {"best_trial": best.trial.name}
-    artifacts = ["recipe.yaml", "trials.yaml", *(name for name in FILES if (out / name).exists())]
+    artifacts = [*HEAD, *(name for name in FILES if (out / name).exists())]
     update_record(out, tags=tags, metrics=metrics, artifacts=artifacts)
 
 
 def _write_report(sweep: Sweep, out: Path, settings: Settings) -> list[Result]:
     return write_report(sweep, out, name=settings.name, levels=settings.levels, cpus=settings.cpus)
-
-
-def _begin(around: ExitStack, sweep: Sweep, out: Path, settings: Settings) -> None:
-    """The resolved recipe and trials on disk, a parent record, a connected Ray."""
-    save_recipe(sweep.recipe, out / "recipe.yaml")
-    write_sweep(sweep, out / "trials.yaml")
-    values = {key: [varied_values(sweep, trial).get(key, "") for trial in sweep.trials] for key in sweep.varied}
-    varied = {f"varied.{key}": ", ".join(dict.fromkeys(found)) for key, found in values.items()}
-    parameters = sweep.recipe.model_dump(mode="json") | {"trials": str(len(sweep.trials))} | varied
-    around.enter_context(recorded(out, kind="sweep", name=settings.name, parent=None, parameters=parameters))
-    update_record(out, artifacts=["recipe.yaml", "trials.yaml"])
-    around.enter_context(ray_cluster())
-
-
-def _tags(sweep: Sweep, trial: Trial) -> dict[str, str]:
-    return {f"varied.{key}": value for key, value in varied_values(sweep, trial).items()}
-
-
-def refuse_conflicts(sweep: Sweep, data: str, out: Path, *, kind: str) -> None:
-    """Refuse a folder of another kind of work, or made by another recipe, before anything in it is touched."""
-    refuse_other_kind(out, kind)
-    if not (Path(data) / "zarr.json").exists():
-        return
-    group = open_group(data)
-    if "format_version" in group.attrs:  # it is missing where the very first write was cut short
-        check_same_recipe(data, group, sweep.recipe.data)
-    if is_complete(data):
-        for trial in sweep.trials:
-            check_run_accepts(trial.training, open_dataset(data), trial.folder(out))
-
-
-def remove_sweep(out: Path, *, kind: str = "sweep", own: Sequence[str] = _OWN) -> None:
-    """Remove what a sweep (or what trains as one) keeps in ``out``, its dataset too; the MLflow store stays.
-
-    Raises
-    ------
-    RecipeError
-        The folder is not one of that kind.
-    """
-    record = read_record(out)
-    if (out / "trials").exists() and (record is None or record.kind != kind):
-        raise RecipeError(
-            f"{out} holds trials, but no {kind} of ours, so --fresh leaves it alone. Choose another --out"
-        )
-    start_over(out)
-    for path in (out / name for name in own):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
 
 
 def judge(outcomes: Sequence[Outcome], *, of: int, strict: bool) -> None:
@@ -224,15 +193,16 @@ def judge(outcomes: Sequence[Outcome], *, of: int, strict: bool) -> None:
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     stopped = [outcome for outcome in outcomes if outcome.state == "stopped"]
     if stopped:
-        error = TrainingStopped(f"{_names(stopped)} not finished: {stopped[0].reason}. {_AGAIN}")
+        error = TrainingStopped(
+            f"{_names(stopped)} not finished: {stopped[0].reason}. Run the same command again to go on"
+        )
         error.exit_status = stopped[0].exit_status
         raise error
     if failed and (strict or len(failed) == of):
-        raise WorkflowError(f"{_names(failed)} failed, the first because: {failed[0].reason}. {_RETRY}")
-
-
-_AGAIN = "Run the same command again to go on"
-_RETRY = "Run the same command again to try them once more, or leave them out"
+        raise WorkflowError(
+            f"{_names(failed)} failed, the first because: {failed[0].reason}. Run the same command again to try them "
+            "once more, or leave them out"
+        )
 
 
 def _names(outcomes: Sequence[Outcome]) -> str:

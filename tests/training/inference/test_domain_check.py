@@ -13,7 +13,7 @@ from training.checkpoints.checkpoint import require_checkpoint
 from training.engine.trainer import train
 from training.inference.domain_check import Seen, noted, part_sizes, remarks, seen_by
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation
-from workflows.pipeline.stage_functions import write_run_head
+from workflows.pipeline.train import write_head
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 2, 15), [0.0, 0.4], indexing="ij"), -1).reshape(-1, 3)
 STRIP = np.stack([np.arange(238), np.arange(1, 239), np.arange(2, 240)], axis=1)
@@ -128,7 +128,7 @@ def test_what_a_run_noted_needs_no_dataset(tmp_path: Path) -> None:
 
 def test_a_training_notes_its_bodies_such_that_none_of_them_is_warned_of(tmp_path: Path) -> None:
     dataset = generate(tiny_dataset(), str(tmp_path / "leg.zarr"))
-    write_run_head(tiny_training(), dataset, tmp_path / "run")
+    write_head(tiny_training(), dataset, tmp_path / "run")
     seen = seen_by(tmp_path / "run" / "checkpoints" / "step-00000001")
     assert seen is not None and seen.vertices == (32, 32)
     for who in dataset.identities("training"):

@@ -22,7 +22,8 @@ from training.reports.report import (
     what_was_run,
     workflow_report,
 )
-from training.reports.run_summary import COMMAND_TAG, duration, moment, this_machine
+from training.reports.run_summary import COMMAND_TAG, duration, moment
+from training.tracking.provenance import this_machine
 from training.tracking.record import end_record, read_record, update_record
 
 

@@ -248,13 +248,17 @@ def test_outage_in_the_middle_of_sending(root: Path, server: Server, monkeypatch
     assert len(history(server, child, "loss/total")) == len(history(server, child, "learning_rate")) == 5
 
 
-def test_the_mirror_says_an_outage_once_and_never_raises(root: Path, caplog, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_mirror_reports_an_outage_once_and_raises_it_at_the_end_of_what_succeeded(
+    root: Path, caplog, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    mirror = Mirror(root, Server("http://127.0.0.1:9"), every=0.01)
-    mirror.start()
-    outage = mirror.close()
-    assert isinstance(outage, TrackingError)
-    assert caplog.text.count("could not be brought up to date") == 1
+    worked = []
+    with pytest.raises(TrackingError), Mirror(root, Server("http://127.0.0.1:9"), every=0.01):
+        worked.append("all")
+    with pytest.raises(ZeroDivisionError), Mirror(root, Server("http://127.0.0.1:9"), every=0.01):
+        worked.append(1 / 0)
+    assert worked == ["all"]
+    assert caplog.text.count("could not be brought up to date") == 2, "once for each mirror"
 
 
 def test_syncing_a_child_alone_brings_its_parent(root: Path, server: Server) -> None:
@@ -273,9 +277,8 @@ def test_records_are_not_sought_among_shards_checkpoints_and_copies(root: Path) 
 
 def test_without_mlflow_nothing_is_sent_and_one_line_says_so(root: Path, caplog, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "mlflow", None)
-    mirror = Mirror(root, Server("http://127.0.0.1:9"), every=0.01)
-    mirror.start()
-    assert mirror.close() is None
+    with Mirror(root, Server("http://127.0.0.1:9"), every=0.01):
+        pass
     assert [record.message for record in caplog.records] == [
         f"MLflow is not installed here, so nothing is sent. Later: dsffnet sync {root}"
     ]

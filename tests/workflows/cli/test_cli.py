@@ -10,12 +10,12 @@ import pytest
 from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
-from tests.support.commands import ROOT, command, fails
+from tests.support.commands import ROOT, command, fails, process
 from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
 from training.engine.trainer import train
-from workflows.pipeline.console import alone_in
+from workflows.pipeline.run_folder import SingleRunFolder
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Pa
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = sys.modules['mlflow'] = None\n")
     recipe = ("--recipe", "smoke", "--set", "training.launcher=inline", "training.ranks=1", "training.steps=2")
     place = ("--data", trained[0], "--out", tmp_path / "run")
-    done = command("train", *recipe, *place, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    done = process("train", *recipe, *place, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
     assert done.returncode == 0 and "trained: " in done.stdout, done.stderr
     assert done.stderr.count("MLflow is not installed here") == 1 and "Traceback" not in done.stderr
 
@@ -149,7 +149,7 @@ def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
 
 
 def test_two_workflows_in_one_folder(tmp_path: Path) -> None:
-    with alone_in(tmp_path / "w"):
+    with SingleRunFolder(tmp_path / "w").alone():
         fails(
             command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another command is at work in"
         )

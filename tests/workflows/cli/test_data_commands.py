@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.bodies import load_body
 from datagen.store import open_dataset
 from tests.support.commands import command, fails
 from tests.support.files import tree_hash
@@ -113,6 +114,7 @@ def test_a_moved_model_file_is_named_when_going_on(tmp_path: Path) -> None:
     made = command("generate", "--recipe", "smpl-paper", "--set", f"{path}/a.npz", *small, "--out", data, "--local")
     assert made.returncode == 0, made.stderr
     (tmp_path / "a.npz").rename(tmp_path / "b.npz")
+    load_body.cache_clear()  # another process would not have it
     fails(command("append", data, "--unseen", "3", "--local"), 1, "a.npz")
     (data / "identity/0001/vertices/c/0/0/0").unlink()
     assert command("verify", data, "--repair", "--set", f"{path}/b.npz").returncode == 0

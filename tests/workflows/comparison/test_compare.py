@@ -1,17 +1,23 @@
 """Comparisons from start to end, on legs: trained, measured on the same triples, shown; then nothing is left to do."""
 
+import io
 import os
 import re
+import shutil
 import subprocess
 import sys
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 
 import mlflow
 import pytest
 
 from datagen.common.errors import RecipeError
+from datagen.generate import inline
+from tests.support.trials import here
 from training.evaluation.evaluate import read_rows
 from training.tracking.record import read_record
+from workflows.cli.main import parsed
 from workflows.comparison import run as comparing
 from workflows.comparison.plan import plan_comparison
 
@@ -39,20 +45,31 @@ FOUR = """\
 """
 
 
-def run(script: str, out: Path, methods: str) -> str:
-    recipe = out.parent / f"{script}.yaml"
+def command(name: str, out: Path, methods: str) -> list[str]:
+    recipe = out.parent / f"{name}.yaml"
     recipe.write_text(LEGS + methods)
-    command = [sys.executable, "-m", "workflows", script, "--recipe", str(recipe), "--out", str(out)]
-    own = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
-    done = subprocess.run(command, cwd=ROOT, env=own, capture_output=True, text=True, timeout=400, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+    return [name, "--recipe", str(recipe), "--out", str(out)]
+
+
+def run(name: str, out: Path, methods: str, store: Path | None = None) -> str:
+    """What the command prints; its tasks run in this process, and MLflow's store is a copy of an empty one."""
+    if store:
+        out.mkdir()
+        shutil.copy(store, out / "mlflow.db")
+    with pytest.MonkeyPatch.context() as patched, redirect_stdout(io.StringIO()) as said:
+        patched.delenv("MLFLOW_TRACKING_URI", raising=False)
+        patched.setattr("workflows.sweep.run.ray_cluster", nullcontext)
+        patched.setattr("workflows.comparison.run.ray_trials", here)
+        patched.setattr("workflows.comparison.evaluate.ray_runner", inline)
+        options = parsed(command(name, out, methods))
+        options.command(options)
+    return said.getvalue()
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def compared(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("runs") / "compare"
-    return out, run("compare", out, THREE)
+    return out, run("compare", out, THREE, empty_store)
 
 
 def test_every_method_and_no_op_is_measured_on_the_same_triples(compared: tuple[Path, str]) -> None:
@@ -113,7 +130,7 @@ def test_an_ablation_leaves_the_folder_of_a_comparison_alone(compared: tuple[Pat
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.name != ".lock"}
     plan = plan_comparison(str(out.parent / "compare.yaml"), kind="ablation")
     with pytest.raises(RecipeError, match=r"another kind of work: comparison .*--out"):
-        comparing.run_comparison(plan, out, comparing.Settings())
+        comparing.run_comparison(plan, out)
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
@@ -127,14 +144,24 @@ def test_no_report_of_an_earlier_evaluation_outlives_the_start_of_a_new_one(
         (tmp_path / name).write_text("of an earlier evaluation")
     monkeypatch.setattr(comparing, "evaluate_methods", cut_short)
     monkeypatch.setattr(comparing, "open_dataset", lambda url: None)
+    plan = plan_comparison("small", kind="comparison")
     with pytest.raises(KeyboardInterrupt):
-        comparing._evaluate(plan_comparison("small", kind="comparison"), "data", {}, tmp_path)
+        comparing._evaluate(plan, comparing.folder_of(plan, tmp_path), {})
     assert not any((tmp_path / name).exists() for name in comparing.REPORTS)
 
 
-def test_an_ablation_trains_four_and_gives_table_three(tmp_path: Path) -> None:
-    said = run("ablation", tmp_path / "ablation", FOUR)
+def test_an_ablation_trains_four_and_gives_table_three(tmp_path: Path, empty_store: Path) -> None:
+    said = run("ablation", tmp_path / "ablation", FOUR, empty_store)
     assert "Table 3" in said and all(name in said for name in ("w/o FFAdaIN", "w/o side target", "w/o L_edge"))
     assert (tmp_path / "ablation" / "evaluation" / "figures" / "ablation.png").stat().st_size > 5000
     record = read_record(tmp_path / "ablation")
     assert record is not None and record.kind == "ablation" and record.status == "FINISHED"
+
+
+@pytest.mark.cluster
+@pytest.mark.timeout(600)
+def test_on_real_ray(tmp_path: Path) -> None:
+    own = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
+    words = [sys.executable, "-m", "workflows", *command("compare", tmp_path / "out", THREE)]
+    done = subprocess.run(words, cwd=ROOT, env=own, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0 and "Table 2" in done.stdout, done.stderr[-3000:]

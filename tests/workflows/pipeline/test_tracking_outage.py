@@ -136,23 +136,21 @@ def test_missing_at_the_start_killed_in_the_middle_missing_at_the_end(server: Tr
     root = tmp_path / "workflow"
     run = begin(root)
     mirror = Mirror(root, Server(server.uri), every=0.05, after_failure=0.2)
-    with training(run) as pauses:
-        mirror.start()
-        wait_for(lambda: len(pauses) > 100, 60)  # nobody there yet
-        server.start()
-        wait_for(lambda: noted(run, server) > 0, 60)
-        server.kill()
-        server.start()
-        reached = (run / "metrics.jsonl").stat().st_size
-        wait_for(lambda: noted(run, server) >= reached, 60)
-        server.kill()
-        lines = len(pauses)
-        wait_for(lambda: len(pauses) > lines + 50, 10)
-    end_record(run, "FINISHED")
-    end_record(root, "FINISHED")
-    began = time.perf_counter()
-    outage = mirror.close()
-    assert isinstance(outage, TrackingError) and "dsffnet sync" in str(outage)
+    with pytest.raises(TrackingError, match="dsffnet sync"), mirror:
+        with training(run) as pauses:
+            wait_for(lambda: len(pauses) > 100, 60)  # nobody there yet
+            server.start()
+            wait_for(lambda: noted(run, server) > 0, 60)
+            server.kill()
+            server.start()
+            reached = (run / "metrics.jsonl").stat().st_size
+            wait_for(lambda: noted(run, server) >= reached, 60)
+            server.kill()
+            lines = len(pauses)
+            wait_for(lambda: len(pauses) > lines + 50, 10)
+        end_record(run, "FINISHED")
+        end_record(root, "FINISHED")
+        began = time.perf_counter()
     assert time.perf_counter() - began < 30, "the end of the work waits for no server that is gone"
     assert sorted(pauses)[len(pauses) // 2] < 3 * _PAUSE, "a line was written at its usual pace throughout"
     server.start()
@@ -206,12 +204,11 @@ def test_a_server_that_says_nothing_does_not_hold_up_the_work(server: TrackingSe
     server.start()
     run = begin(tmp_path / "workflow")
     mirror = Mirror(tmp_path / "workflow", Server(server.uri), every=0.05, after_failure=0.2)
-    with training(run) as pauses:
-        mirror.start()
-        wait_for(lambda: noted(run, server) > 0, 60)
-        before = len(pauses)
-        server.pause(3)
-        assert len(pauses) - before > 3 / _PAUSE / 4, "the work went on"
-    end_record(run, "FINISHED")
-    assert mirror.close() is None
+    with mirror:
+        with training(run) as pauses:
+            wait_for(lambda: noted(run, server) > 0, 60)
+            before = len(pauses)
+            server.pause(3)
+            assert len(pauses) - before > 3 / _PAUSE / 4, "the work went on"
+        end_record(run, "FINISHED")
     assert_same_as_journal(server, run)

@@ -23,7 +23,8 @@ from training.tracking.mlflow_mirror import publish
 from training.tracking.mlflow_store import prepare_store, sqlite_server
 from training.tracking.record import EXPERIMENT, Server, begin_record, update_record
 from workflows import full
-from workflows.pipeline.console import alone_in, closing_words, guarded, server_of
+from workflows.pipeline.console import guarded, server_of
+from workflows.pipeline.run_folder import SingleRunFolder
 
 ROOT = Path(__file__).parents[3]
 AWKWARD = "a b #1 & 'q' \"d\" ; 日本é [x]{y}|~ $HOME 50:50 @=+,!<>"
@@ -313,7 +314,7 @@ def test_a_second_command_on_one_folder_says_so_at_once_and_changes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    with alone_in(out):
+    with SingleRunFolder(out).alone():
         (out / "recipe.yaml").write_text("of the first")
         before = tree_hash(out)
         for more in ([], ["--fresh"]):
@@ -342,7 +343,7 @@ def test_make_ui_takes_what_the_closing_words_say(tmp_path: Path, monkeypatch: p
     (out / "run" / "evaluation").mkdir(parents=True)
     (out / "run" / "evaluation" / "tables.md").write_text("")
     (out / "mlflow.db").touch()
-    said = closing_words(out, server(out)).splitlines()
+    said = full.closing_words(SingleRunFolder(out), server(out)).splitlines()
     command = next(line for line in said if line.startswith("  make ui"))
     asked = subprocess.run(command, shell=True, capture_output=True, text=True, check=True).stdout.splitlines()
     assert asked[0] == "ui" and Path(asked[-1]).resolve() == out

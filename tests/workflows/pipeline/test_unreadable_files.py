@@ -18,7 +18,10 @@ from training.reports.report import NAMES
 from training.tracking.record import flatten, read_record, write_record
 from workflows import full
 from workflows.cli.main import main
-from workflows.pipeline import stage_functions as pipeline
+from workflows.pipeline import generate, train
+from workflows.pipeline.evaluate import is_evaluated
+from workflows.pipeline.run_folder import RunFolder
+from workflows.pipeline.stage import recorded
 from workflows.pipeline.tasks import TaskRunner
 from workflows.recipe.loader import WorkflowRecipe
 
@@ -32,11 +35,11 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     done: list[str] = []
 
     def stage(name: str) -> Any:
-        def work(recipe: Any, *_: object, folder: Path | None = None, parent: Path, **__: object) -> None:
+        def work(*arguments: Any, parent: Path | None = None, **_: object) -> str:
             done.append(name)
-            with pipeline.recorded(parent / FOLDERS[name], kind=name, name=name, parent=parent, parameters={"a": 1}):
-                if name == "evaluate":
-                    (parent / FOLDERS[name] / "tables.md").write_text("a table")
+            out = parent or arguments[1].path
+            with recorded(out / FOLDERS[name], kind=name, name=name, parent=out, parameters={"a": 1}):
+                return "a table"
 
         return work
 
@@ -45,12 +48,13 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         for name in NAMES:
             (out / name).write_text("a report")
 
-    for name in ("generate", "train", "evaluate"):
-        monkeypatch.setattr(full, f"{name}_stage", stage(name))
+    monkeypatch.setattr(generate, "generate_dataset", stage("generate"))
+    monkeypatch.setattr(full, "train_model", stage("train"))
+    monkeypatch.setattr(full, "evaluate_weights", stage("evaluate"))
     monkeypatch.setattr(full, "workflow_report", report)
-    monkeypatch.setattr(full, "is_complete", lambda *_: True)
+    monkeypatch.setattr(generate, "is_complete", lambda *_: True)
     monkeypatch.setattr(full, "is_trained", lambda *_: True)
-    monkeypatch.setattr(full, "is_evaluated", lambda recipe, data, run: read_record(run / "evaluation") is not None)
+    monkeypatch.setattr(full, "is_evaluated", lambda recipe, data, run: read_record(run.evaluation.path) is not None)
     return done
 
 
@@ -87,7 +91,7 @@ def evaluated(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     record = read_record(evaluation)
     assert record is not None
     parameters = flatten(EvaluationRecipe().model_dump(mode="json"))
-    about = pipeline.about_dataset(open_dataset(data))
+    about = generate.about_dataset(open_dataset(data))
     write_record(evaluation, replace(record, dataset=about, parameters=parameters, status="FINISHED"))
     return out
 
@@ -98,7 +102,7 @@ def test_an_evaluation_with_a_damaged_file_is_not_done(evaluated: Path, name: st
     run, data = evaluated / "run", str(evaluated / "dataset.zarr")
     path = run / "evaluation" / name
     whole = path.read_bytes()
-    assert pipeline.is_evaluated(EvaluationRecipe(), data, run)
+    assert is_evaluated(EvaluationRecipe(), data, RunFolder(run))
     path.unlink()
     try:
         if content is None:
@@ -106,7 +110,7 @@ def test_an_evaluation_with_a_damaged_file_is_not_done(evaluated: Path, name: st
         else:
             path.write_bytes(content)
         read_again = name in ("rows.csv", "record.json") or (name == "tables.md" and content == b"\xff")
-        is_whole = pipeline.is_evaluated(EvaluationRecipe(), data, run)
+        is_whole = is_evaluated(EvaluationRecipe(), data, RunFolder(run))
         assert is_whole == (content not in (b"", None) and not read_again)
     finally:
         path.unlink()
@@ -124,8 +128,8 @@ def test_a_run_without_a_readable_record_is_one_line(tmp_path: Path, capsys: pyt
 def test_a_run_has_the_permissions_of_the_umask(tmp_path: Path, dataset: str) -> None:
     before = os.umask(0o077)
     try:
-        pipeline.train_stage(
-            tiny_training(steps=4), dataset, tmp_path / "run", parent=None, tasks=TaskRunner(local=True)
+        train.train_model(
+            tiny_training(steps=4), dataset, RunFolder(tmp_path / "run"), parent=None, tasks=TaskRunner(local=True)
         )
     finally:
         os.umask(before)
@@ -143,9 +147,7 @@ def test_links_that_lead_out_of_a_stage_are_refused_before_anything_is_written(t
     (tmp_path / "run" / "evaluation" / name).symlink_to(victim if "." not in name else victim / "record.json")
     with (
         pytest.raises(UnsafeFileError, match="link"),
-        pipeline.recorded(
-            tmp_path / "run" / "evaluation", kind="evaluate", name="x", parent=tmp_path / "run", parameters={}
-        ),
+        recorded(tmp_path / "run" / "evaluation", kind="evaluate", name="x", parent=tmp_path / "run", parameters={}),
     ):
         pytest.fail("it began")
     assert [path.name for path in victim.iterdir()] == ["record.json"]

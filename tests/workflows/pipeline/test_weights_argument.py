@@ -10,10 +10,12 @@ from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.engine.trainer import train
 from training.recipes.training import EvaluationRecipe
-from workflows.pipeline import stage_functions as pipeline
-from workflows.pipeline.console import remove_run
+from workflows.cli.declare import which_checkpoint
+from workflows.pipeline.evaluate import evaluate_weights
+from workflows.pipeline.run_folder import RunFolder
 from workflows.pipeline.tasks import TaskRunner
-from workflows.pipeline.weights_argument import evaluated, which_checkpoint
+from workflows.pipeline.train import train_model
+from workflows.pipeline.weights_argument import evaluated
 
 RECIPE = EvaluationRecipe(triples=1, emd_points=8, examples=1)
 
@@ -53,7 +55,7 @@ def test_weights_without_a_journal_get_all_but_the_curve(workflow: Path, dataset
         (workflow / "exported", workflow / "exported" / "evaluation", False),
         (workflow / "run" / "checkpoints" / "step-00000004", workflow / "run" / "evaluation-step-4", True),
     ):
-        assert "step" in pipeline.evaluate_stage(RECIPE, dataset, place, parent=None, tasks=TaskRunner())
+        assert "step" in evaluate_weights(RECIPE, dataset, place, parent=None, tasks=TaskRunner())
         assert (folder / "tables.md").exists() and (folder / "figures" / "examples.png").exists()
         assert (folder / "figures" / "training-curve.png").exists() == has_curve
     assert sorted((workflow / "run" / "checkpoints").rglob("*")) == before
@@ -66,7 +68,7 @@ def test_which_checkpoint_is_a_word_or_a_step() -> None:
 
 
 def test_a_training_without_a_record_may_be_begun_afresh(workflow: Path) -> None:
-    remove_run(workflow / "run")
+    RunFolder(workflow / "run").remove()
     assert not (workflow / "run" / "checkpoints").exists() and not (workflow / "run" / "metrics.jsonl").exists()
 
 
@@ -75,5 +77,5 @@ def test_the_driver_says_where_meshes_were_kept(
 ) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "input.json").write_text('{"where": "memory (1 MB)"}')
-    pipeline.train_stage(tiny_training(), dataset, tmp_path / "run", parent=None, tasks=TaskRunner())
+    train_model(tiny_training(), dataset, RunFolder(tmp_path / "run"), parent=None, tasks=TaskRunner())
     assert "train: meshes were kept in " in capsys.readouterr().out

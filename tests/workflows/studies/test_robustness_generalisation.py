@@ -18,10 +18,15 @@ from training.engine.trainer import train
 from training.evaluation.generalisation import have_truth
 from training.evaluation.robustness import read_rows
 from training.tracking.record import begin_record, read_record
+from workflows.cli.main import parsed
 from workflows.studies.common import about_weights, folder_of, weights_of
-from workflows.studies.generalisation import add_generalisation_options, examples, generalisation_command
+from workflows.studies.generalisation import examples
 from workflows.studies.mesh_kinds import Sizes, animals_recipe, imported_kind, own_kind, own_recipe, people_recipe
-from workflows.studies.robustness import add_robustness_options, robustness_command
+
+
+def study(*words: str) -> None:
+    options = parsed(words)
+    options.command(options)
 
 
 @pytest.fixture
@@ -30,26 +35,12 @@ def run(dataset: str, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def robustness(*words: str) -> None:
-    """The command, in this process."""
-    made = argparse.ArgumentParser()
-    add_robustness_options(made)
-    robustness_command(made.parse_args(words))
-
-
-def generalisation(*words: str) -> None:
-    """The command, in this process."""
-    made = argparse.ArgumentParser()
-    add_generalisation_options(made)
-    generalisation_command(made.parse_args(words))
-
-
 def test_robustness_writes_its_files_and_goes_on_from_them(
     dataset: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "study"
     words = [str(run), "--data", dataset, "--out", str(out), "--triples", "2", "--only", "noise"]
-    robustness(*words)
+    study("robustness", *words)
     text = (out / "robustness.md").read_text()
     assert text in capsys.readouterr().out and "DSFFNet: step 8" in text and "| Noise" in text
     record = read_record(out)
@@ -57,10 +48,10 @@ def test_robustness_writes_its_files_and_goes_on_from_them(
     assert all((out / name).stat().st_size for name in record.artifacts) and len(record.artifacts) == 5
     monkeypatch.setattr("workflows.studies.robustness._draw", lambda *_: None)  # takes seconds, and is seen above
     before = (out / "rows.csv").read_text()
-    robustness(*words, "shift")
+    study("robustness", *words, "shift")
     assert (out / "rows.csv").read_text().startswith(before), "what was measured is kept, more is added"
     assert {row.disturbance for row in read_rows(out / "rows.csv")} == {"", "noise", "shift"}
-    robustness(*words[:5], "--triples", "1", "--only", "shift")
+    study("robustness", *words[:5], "--triples", "1", "--only", "shift")
     assert {row.disturbance for row in read_rows(out / "rows.csv")} == {"", "shift"}, "others were of other triples"
 
 
@@ -70,9 +61,8 @@ def test_two_runs_of_one_network_are_told_apart_by_their_folders(
     train(tiny_training(steps=4), data=dataset, run=tmp_path / "second")
     monkeypatch.setattr("workflows.studies.robustness._draw", lambda *_: None)
     out = tmp_path / "both"
-    robustness(
-        str(run), str(tmp_path / "second"), "--data", dataset, "--out", str(out), "--triples", "1", "--only", "scale"
-    )
+    runs = (str(run), str(tmp_path / "second"))
+    study("robustness", *runs, "--data", dataset, "--out", str(out), "--triples", "1", "--only", "scale")
     names = {row.method for row in read_rows(out / "rows.csv")}
     assert names == {"target unchanged", f"DSFFNet {tmp_path.name}", "DSFFNet second"}
 
@@ -87,7 +77,7 @@ def test_two_runs_of_one_network_are_told_apart_by_their_folders(
 )
 def test_impossible_wishes_are_refused(dataset: str, run: Path, tmp_path: Path, words: list[str], message: str) -> None:
     with pytest.raises(RecipeError, match=message):
-        robustness(str(run), "--data", dataset, "--out", str(tmp_path / "none"), *words)
+        study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / "none"), *words)
     assert not (tmp_path / "none").exists()
 
 
@@ -98,7 +88,7 @@ def test_a_study_replaces_nothing_of_others(dataset: str, run: Path, tmp_path: P
     begin_record(run, name="train", kind="train", parent=None, parameters={})
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(RecipeError, match=message):
-        robustness(str(run), "--data", dataset, "--out", str(tmp_path / folder), "--triples", "1")
+        study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / folder), "--triples", "1")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
@@ -122,7 +112,7 @@ def test_generalisation_to_a_persons_own_data(
     monkeypatch.setattr("workflows.studies.generalisation.make_kinds", lambda *_, **__: [made])
     (tmp_path / "mine.zarr").symlink_to(dataset)
     out = tmp_path / "study"
-    generalisation(str(run), "--data", str(tmp_path / "mine.zarr"), "--out", str(out), "--triples", "3")
+    study("generalisation", str(run), "--data", str(tmp_path / "mine.zarr"), "--out", str(out), "--triples", "3")
     text = (out / "generalisation.md").read_text()
     assert text in capsys.readouterr().out and "| mine 32" in text and "| leg 32" in text
     assert all((out / name).stat().st_size for name in ("rows.csv", "heat-map.png", "examples.png"))
@@ -130,7 +120,7 @@ def test_generalisation_to_a_persons_own_data(
 
 def test_generalisation_refuses_what_has_no_transfer(run: Path) -> None:
     with pytest.raises(RecipeError, match=r"--identities 1 .*two identities"):
-        generalisation(str(run), "--identities", "1")
+        study("generalisation", str(run), "--identities", "1")
 
 
 def test_people_are_the_same_in_every_topology_and_new() -> None:

@@ -22,6 +22,7 @@ import yaml
 from datagen.common.errors import ClusterError, DsffnetError, RecipeError, TrainingError, TrainingStopped, WorkflowError
 from tests.support.files import tree_hash
 from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.trials import here
 from training.checkpoints.checkpoint import require_checkpoint
 from training.engine.distributed import STOP_FILE, StopRequest
 from training.engine.trainer import train
@@ -29,13 +30,14 @@ from training.inference.predict import load_trained
 from training.recipes.training import TrainingRecipe
 from training.tracking.journal import read_journal
 from training.tracking.record import flatten, read_record
+from workflows.pipeline.run_folder import SweepFolder
 from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
 from workflows.recipe.names import named_training
 from workflows.sweep import run as sweeping
 from workflows.sweep.plan import Sweep, Trial, known_sweeps, parse_grid, plan_sweep, read_sweep, split_values
 from workflows.sweep.ray_trials import Outcome, Place, ray_trials, train_trial
 from workflows.sweep.report import parse_levels
-from workflows.sweep.run import Settings, judge, remove_sweep, run_sweep
+from workflows.sweep.run import Settings, judge, run_sweep
 
 ROOT = Path(__file__).parents[3]
 HOST = {"Alive": True, "Resources": {"CPU": 2.0}}
@@ -90,15 +92,6 @@ def out(_swept: Path, tmp_path: Path) -> Path:
 def sweep_of(folder: Path, recipe: str, trials: Any) -> Sweep:
     (folder / "trials.yaml").write_text(yaml.safe_dump(trials))
     return plan_sweep(recipe=recipe, shared=[], trials=str(folder / "trials.yaml"))
-
-
-def here(
-    trials: Sequence[Trial], place: Place, *, tags: Callable[[Trial], dict[str, str]], **_: Any
-) -> Iterator[Outcome | None]:
-    """Run trials in this process, one after the other."""
-    for trial in trials:
-        yield train_trial(trial, place, tags=tags(trial), threads=torch.get_num_threads())
-        yield None
 
 
 def nowhere(*_: Any, **__: Any) -> Iterator[Outcome | None]:
@@ -345,7 +338,7 @@ def test_a_programming_error_in_one_trial_is_its_own_and_leaves_a_traceback(
     def broken(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("by nothing\nat all")
 
-    monkeypatch.setattr("workflows.sweep.ray_trials.launch", broken)
+    monkeypatch.setattr("workflows.pipeline.train.launch", broken)
     with pytest.raises(WorkflowError, match=r"3 trials \(slow, wild, good\) failed.*ZeroDivisionError: by nothing \("):
         run_sweep(three, out, Settings("tiny"), runner=here)
     assert "Traceback" in (out / "trials" / "good" / "failure.txt").read_text()
@@ -373,13 +366,13 @@ def test_another_recipe_in_the_same_folder_is_refused_before_anything_is_touched
 
 def test_fresh_removes_the_sweep_and_leaves_strangers_alone(swept: Path, tmp_path: Path) -> None:
     (swept / "notes.txt").write_text("mine")
-    remove_sweep(swept)
+    SweepFolder(swept).remove()
     assert (swept / "notes.txt").exists()
     ours = ("trials", "dataset.zarr", "sweep.md", "sweep.csv", "figures/sweep.png", "best.yaml", "record.json")
     assert not [name for name in ours if (swept / name).exists()]
     (tmp_path / "other" / "trials").mkdir(parents=True)
     with pytest.raises(RecipeError, match="no sweep of ours"):
-        remove_sweep(tmp_path / "other")
+        SweepFolder(tmp_path / "other").remove()
 
 
 def test_some_failures_are_no_failure_unless_strict() -> None:

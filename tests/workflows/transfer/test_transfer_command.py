@@ -16,7 +16,7 @@ from datagen.mesh import sequences as mesh_sequences
 from datagen.mesh.files import MeshFile, load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
-from tests.support.commands import command, fails
+from tests.support.commands import command, fails, process
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.engine.trainer import train
 from training.inference.orientation import Axes
@@ -51,8 +51,7 @@ def transfer(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tran
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(*words: object) -> None:
-        typed = cli.with_axes_joined(["transfer", *map(str, words), "--model", str(run)])
-        options = cli._parser(["transfer"]).parse_args(typed)
+        options = cli.parsed(["transfer", *map(str, words), "--model", str(run)])
         options.command(options)
 
     return call
@@ -112,9 +111,8 @@ def test_axes_by_hand_give_the_same_body_lying_as_its_file(transfer: Transfer, r
 
 @pytest.mark.parametrize("words", [("--front", "-Y"), ("--front=-Y",), ("--front", "-Y,-Y"), ("--front", "-y")])
 def test_an_axis_with_a_minus_is_no_option(words: tuple[str, ...]) -> None:
-    found = cli._parser(["transfer"]).parse_args(cli.with_axes_joined(["transfer", "--model=r", "--out=o", *words]))
-    assert found.front.upper() in ("-Y", "-Y,-Y")
-    assert cli.with_axes_joined(["a", "--front", "--up", "-Y"]) == ["a", "--front", "--up=-Y"]
+    found = cli.parsed(["transfer", "--model=r", "--out=o", *words, "--up", "-Z"])
+    assert found.front.upper() in ("-Y", "-Y,-Y") and found.up == "-Z"
 
 
 def test_of_several_geometries_one_is_chosen(transfer: Transfer, tmp_path: Path) -> None:
@@ -365,9 +363,7 @@ def test_models_and_servers_that_are_not_there(run: Path, tmp_path: Path, monkey
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(model: str) -> None:
-        options = cli._parser(["transfer"]).parse_args(
-            ["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model]
-        )
+        options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model])
         options.command(options)
 
     with pytest.raises(CheckpointError, match="no usable checkpoint"):
@@ -386,7 +382,7 @@ def test_a_transfer_needs_neither_ray_nor_mlflow_nor_pandas(run: Path, tmp_path:
     banned = ", ".join(f"'{name}': None" for name in ("ray", "mlflow", "pandas", "anny", "smplx"))
     (tmp_path / "sitecustomize.py").write_text(f"import sys\nsys.modules.update({{{banned}}})\n")
     words = ("--model", run, run.parent / "pose.obj", run.parent / "person.obj", "-o", tmp_path / "x.obj")
-    done = command("transfer", *words, PYTHONPATH=f"{tmp_path}:{Path(cli.__file__).parents[1]}")
+    done = process("transfer", *words, PYTHONPATH=f"{tmp_path}:{Path(cli.__file__).parents[1]}")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "x.obj").is_file()
 

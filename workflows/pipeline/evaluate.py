@@ -1,0 +1,141 @@
+"""The stage that measures a run or weights: rows, tables, figures, meshes and viewer."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from datagen.common.errors import DsffnetError
+from datagen.common.files import read_text_within, write_atomically
+from datagen.store import Dataset, open_dataset
+from training.checkpoints.checkpoint import Which
+from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_rows, triples_in, write_rows
+from training.evaluation.paper_numbers import method_name
+from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_of, report
+from training.inference.predict import load_trained
+from training.recipes.training import EvaluationRecipe
+from training.reports.examples import draw_comparisons, draw_training_curve, examples_of
+from training.tracking.record import Record, flatten, read_record, update_record
+from workflows.pipeline.generate import CONTENT, about_dataset
+from workflows.pipeline.progress import bar, sampling
+from workflows.pipeline.run_folder import EvaluationFolder, RunFolder
+from workflows.pipeline.stage import recorded
+from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.weights_argument import evaluated
+
+ARTIFACTS = ["rows.csv", "tables.md", "viewer.html", "figures", "meshes"]
+
+
+def evaluate_weights(
+    recipe: EvaluationRecipe,
+    data: str,
+    place: Path,
+    *,
+    parent: Path | None,
+    tasks: TaskRunner,
+    which: Which = "result",
+) -> str:
+    """Measure a run or weights, and show what came out; returns the report."""
+    dataset, what = open_dataset(data), evaluated(place, which)
+    network, trained, step = load_trained(what.weights)
+    method = Method(method_name(trained.network), str(what.weights))
+    folder, parameters = EvaluationFolder(what.folder(dataset)), recipe.model_dump(mode="json")
+    with (
+        folder.alone(),
+        recorded(folder.path, kind="evaluate", name="evaluate", parent=parent, parameters=parameters),
+    ):
+        with sampling(folder.load):
+            runner = tasks.measure(dataset, recipe)
+            rows = evaluate([method], data, recipe, tasks=runner, keep=folder.measured, progress=evaluation_bar)
+        write_rows(rows, folder.rows)
+        about = about_weights(step, dataset)
+        text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
+        write_atomically(folder.tables, text.encode())
+        draw_comparisons(examples_of(dataset, network, recipe, rows), folder.path, title=_title(dataset))
+        if RunFolder(what.home).journal.exists():  # exported weights have none
+            draw_training_curve(what.home, folder.curve, baselines=_no_ops(rows))
+        end_evaluation(folder, dataset, rows, ARTIFACTS)
+    return text
+
+
+def end_evaluation(folder: EvaluationFolder, dataset: Dataset, rows: list[Row], artifacts: list[str]) -> None:
+    """Give an evaluation's record its data, its artifacts and its metrics."""
+    metrics = summary_metrics(rows)
+    update_record(folder.path, dataset=about_dataset(dataset), artifacts=artifacts, metrics=metrics)
+
+
+def evaluation_bar(chunks: Iterable[list[Row]], total: int, done: int) -> Iterator[list[Row]]:
+    """A bar that counts triples while chunks of rows come in; ``done`` of them were measured before."""
+    with bar(total=total, initial=done, what="evaluate", unit="triple") as shown:
+        for rows in chunks:
+            shown.update(triples_in(rows))
+            yield rows
+
+
+def _no_ops(rows: list[Row]) -> dict[str, float]:
+    """PMD on unseen poses of the methods that do nothing."""
+    found = {name: [row.pmd for row in rows if (row.method, row.pose_type) == (name, "unseen")] for name in NO_OPS}
+    return {f"{name} (unseen)": float(np.mean(values)) for name, values in found.items() if values}
+
+
+def is_evaluated(recipe: EvaluationRecipe, data: str, run: RunFolder) -> bool:
+    """Whether the outputs of this evaluation on this dataset are there."""
+    record = read_record(run.evaluation.path)
+    if record is None or record.status != "FINISHED" or record.parameters != flatten(recipe.model_dump(mode="json")):
+        return False
+    shown = (run.evaluation.examples, run.evaluation.curve)
+    return _is_of(record, data) and is_whole(run.evaluation) and all(map(_has_content, shown))
+
+
+def _is_of(record: Record, data: str) -> bool:
+    """Whether a record's dataset has the content of this one, wherever either lies: folders are moved and copied."""
+    try:
+        there = about_dataset(open_dataset(data))
+    except DsffnetError:
+        return False
+    return record.dataset is not None and all(record.dataset.get(key) == there[key] for key in CONTENT)
+
+
+def is_whole(evaluation: EvaluationFolder) -> bool:
+    """Whether the viewer of an evaluation is there, and its rows and tables can be read."""
+    try:
+        rows, tables = read_rows(evaluation.rows), read_text_within(evaluation.path, evaluation.tables.name)
+        return bool(rows and tables) and _has_content(evaluation.viewer)
+    except (OSError, DsffnetError):
+        return False
+
+
+def _has_content(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+def summary_metrics(rows: list[Row]) -> dict[str, float]:
+    """Means of the metrics as MLflow shows them, in the table's units: ``pmd_unseen``, ``target_unchanged/...``.
+
+    Where several networks were measured, theirs have their names before them: ``DSFFNet/pmd_unseen``.
+    """
+    found, networks = {}, [method for method in methods_of(rows) if method not in NO_OPS]
+    for method in methods_of(rows):
+        prefix = "" if networks == [method] else f"{method.replace(' ', '_')}/"
+        for pose_type in sorted({row.pose_type for row in rows}):
+            for column in COLUMNS:
+                mean = mean_of(rows, method=method, pose_type=pose_type, field=column.field)
+                found[f"{prefix}{column.field}_{pose_type}"] = mean * column.factor
+    return found
+
+
+def _title(dataset: Dataset) -> str:
+    least, most = _vertex_counts(dataset)
+    counts = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    return f"Pose transfer on {dataset.recipe.body.family} bodies of {counts} vertices"
+
+
+def emd_points_of(recipe: EvaluationRecipe, dataset: Dataset) -> int:
+    """Vertices that the earth mover's distance is taken of: as asked, or as many as there are."""
+    return min(recipe.emd_points, _vertex_counts(dataset)[1])
+
+
+def _vertex_counts(dataset: Dataset) -> tuple[int, int]:
+    """The fewest and the most vertices of the identities that are evaluated."""
+    counts = [dataset.vertex_count(identity) for identity in dataset.identities("evaluation") or [0]]
+    return min(counts), max(counts)

@@ -1,0 +1,71 @@
+"""The stage that makes the dataset."""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from datagen.common.errors import DsffnetError
+from datagen.common.files import write_atomically
+from datagen.generate import generate
+from datagen.grid import Grid
+from datagen.recipe import DatasetRecipe
+from datagen.store import Dataset, ManifestRow, open_dataset
+from datagen.store.verify import describe
+from training.reports.contact_sheet import draw_contact_sheet
+from training.tracking.record import has_record, update_record
+from workflows.pipeline.progress import bar, sampling
+from workflows.pipeline.run_folder import WorkflowFolder
+from workflows.pipeline.stage import Stage, recorded
+from workflows.pipeline.tasks import TaskRunner
+
+CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
+"""Attributes that tell a dataset from all others, wherever it lies."""
+
+
+def generate_stage(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> Stage:
+    """The stage that makes a workflow's dataset."""
+    return Stage(
+        "generate",
+        depends_on=recipe.model_dump(mode="json"),
+        intact=lambda: is_complete(folder.data) and has_record(folder.generate),
+        work=lambda: generate_dataset(recipe, folder, tasks),
+    )
+
+
+def generate_dataset(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> None:
+    """Make the dataset, its description and a contact sheet of it, and record it."""
+    out, parameters = folder.generate, recipe.model_dump(mode="json")
+    with recorded(out, kind="generate", name="generate", parent=folder.path, parameters=parameters):
+        with sampling(out / "system.jsonl"):
+            dataset = generate(recipe, folder.data, run=tasks.make_shards, progress=generation_bar)
+        write_atomically(out / "dataset.json", json.dumps(describe(folder.data), indent=1).encode())
+        draw_contact_sheet(dataset, out / "contact-sheet.png")
+        statistics = dataset.attributes["statistics"]
+        update_record(
+            out,
+            dataset=about_dataset(dataset),
+            artifacts=["dataset.json", "contact-sheet.png"],
+            metrics={"meshes": float(statistics["meshes"]), "megabytes": statistics["bytes"] / 1e6},
+        )
+
+
+def generation_bar(rows: Iterable[ManifestRow], grid: Grid) -> Iterator[ManifestRow]:
+    """A bar that counts meshes while shards come in."""
+    with bar(total=grid.mesh_count, what="generate", unit="mesh") as shown:
+        for row in rows:
+            shown.update(row.rows)
+            yield row
+
+
+def about_dataset(dataset: Dataset) -> dict[str, str]:
+    """What identifies a dataset."""
+    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in CONTENT}
+
+
+def is_complete(data: str) -> bool:
+    """Whether a complete dataset is there, none of its shards missing."""
+    try:
+        open_dataset(data)
+    except DsffnetError:
+        return False
+    return True

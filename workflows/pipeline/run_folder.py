@@ -1,0 +1,270 @@
+"""Every name in the folders of a workflow, of a run and of an evaluation: where it is, and what ``--fresh`` removes.
+
+To add a file: one line here. The test of a finished workflow fails for a file that no line owns.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import ClassVar, Generic, TypeVar
+
+from filelock import Timeout
+
+from datagen.common.errors import RecipeError, WorkflowError
+from datagen.common.files import lock_within
+from training.tracking.record import read_record
+
+Value = TypeVar("Value")
+
+
+class _Entry(Generic[Value]):
+    """An entry of a folder, which thereby owns it: its path, or the folder that it is; ``kept`` when all is removed."""
+
+    def __init__(self, name: str, made: Callable[[Path], Value], *, kept: bool = False) -> None:
+        self._name, self._made, self._kept = name, made, kept
+
+    def __set_name__(self, folder: "type[_Folder]", _: str) -> None:
+        folder.names = (*folder.names, self._name)
+        if self._kept:
+            folder.kept = (*folder.kept, self._name)
+
+    def __get__(self, folder: "_Folder", _: object) -> Value:
+        return self._made(folder.path / self._name)
+
+
+def _file(name: str, *, kept: bool = False) -> _Entry[Path]:
+    return _Entry(name, Path, kept=kept)
+
+
+class _Folder:
+    """A folder that we write: ``names`` of its entries (with wildcards), and those ``kept`` when all is removed."""
+
+    names: ClassVar[tuple[str, ...]] = ("*.unreadable",)
+    kept: ClassVar[tuple[str, ...]] = ()
+    record = _file("record.json")
+    mirror_note = _file("mlflow.json")
+    mirror_lock = _file(".mlflow.lock")
+    load = _file("system.jsonl")
+    lock = _file(".lock", kept=True)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def owned(self) -> list[Path]:
+        """The entries that are there and belong to the folder; what tells whose it is comes last."""
+        found = [path for path in self._entries() if _matches(path, self.names)]
+        return sorted(found, key=lambda path: path.name in ("record.json", "recipe.yaml"))
+
+    def strangers(self) -> list[Path]:
+        """The entries that are there and do not."""
+        return [path for path in self._entries() if not _matches(path, self.names)]
+
+    def remove(self) -> None:
+        """Remove what belongs to the folder, but for what is kept; of a link, only the link."""
+        for path in self.owned():
+            if _matches(path, self.kept):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Hold the folder, which is made, while the block runs; the operating system frees it if this process dies.
+
+        Raises
+        ------
+        WorkflowError
+            Another process holds it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            with lock_within(self.path, self.lock.name).acquire(timeout=0):
+                yield
+        except Timeout as error:
+            raise WorkflowError(
+                f"another command is at work in {self.path}. Wait for it, or stop it, then run again"
+            ) from error
+
+    def _entries(self) -> list[Path]:
+        return sorted(self.path.iterdir()) if self.path.is_dir() else []
+
+
+class EvaluationFolder(_Folder):
+    """HOME/evaluation[-DATASET][-LABEL], or OUT/evaluation of a comparison."""
+
+    rows = _file("rows.csv")
+    tables = _file("tables.md")
+    viewer = _file("viewer.html")
+    inference = _file("inference.json")
+    figures = _file("figures")
+    meshes = _file("meshes")
+    measured = _file("measured")
+    chunks = _file("chunks")
+    robustness = _file("robustness")
+    generalisation = _file("generalisation")
+
+    @property
+    def examples(self) -> Path:
+        """The figure of examples."""
+        return self.figures / "examples.png"
+
+    @property
+    def curve(self) -> Path:
+        """The training curve, with the errors of the no-op baselines."""
+        return self.figures / "training-curve.png"
+
+
+class RunFolder(_Folder):
+    """The folder of one training."""
+
+    names = (*_Folder.names, "evaluation-*")
+    recipe = _file("recipe.yaml")
+    provenance = _file("provenance.json")
+    journal = _file("metrics.jsonl")
+    checkpoints = _file("checkpoints")
+    latest = _file("latest")
+    best = _file("best")
+    figures = _file("figures")
+    pictures = _file("pictures")
+    input = _file("input.json")
+    stop = _file("stop")
+    failure = _file("failure.json")
+    traceback = _file("failure.txt")
+    not_finite = _file("not-finite.json")
+    launch_mark = _file(".launch")
+    ray = _file("ray")
+    evaluation = _Entry("evaluation", EvaluationFolder)
+    lock = _file(".driver.lock", kept=True)
+
+    @property
+    def curve(self) -> Path:
+        """The training curve."""
+        return self.figures / "training-curve.png"
+
+    @property
+    def coefficients(self) -> Path:
+        """The adaptive coefficients over training."""
+        return self.figures / "adaptive-coefficients.png"
+
+    def remove(self) -> None:
+        """Remove what a training keeps in its folder.
+
+        Raises
+        ------
+        RecipeError
+            The folder is not a training run's.
+        """
+        if self._entries() and not self._is_training():
+            raise RecipeError(
+                f"{self.path} is not the folder of a training, so --fresh leaves it alone. Choose another --out"
+            )
+        super().remove()
+
+    def _is_training(self) -> bool:
+        """By its record, or, where torchrun trained without a workflow, by what every training writes."""
+        record = read_record(self.path)
+        return record.kind == "train" if record else self.checkpoints.is_dir() and self.journal.is_file()
+
+
+class WorkflowFolder(_Folder):
+    """The folder of a workflow, or of another ``kind`` of work that makes a dataset and trains on it."""
+
+    kind: ClassVar[str] = "workflow"
+    names = (*_Folder.names, "mlflow.db*")
+    kept = (*_Folder.kept, "mlflow.db*")
+    recipe = _file("recipe.yaml")
+    dataset = _file("dataset.zarr", kept=True)
+    generate = _file("generate")
+    stages = _file("stages")
+    report = _file("report.md")
+    page = _file("report.html")
+    artifacts = _file("mlartifacts", kept=True)
+
+    @property
+    def data(self) -> str:
+        """The URL of the dataset."""
+        return str(self.dataset)
+
+    def require_kind(self) -> None:
+        """Refuse a folder that another kind of work has its record in, which would be replaced.
+
+        Raises
+        ------
+        RecipeError
+            It is one.
+        """
+        record = read_record(self.path)
+        if record and record.kind != self.kind:
+            raise RecipeError(
+                f"{self.path} is the folder of another kind of work: {record.kind} {record.name!r}. "
+                "Choose another --out"
+            )
+
+    def remove(self) -> None:
+        """Remove what the work keeps in the folder, its dataset too; the MLflow store stays.
+
+        Raises
+        ------
+        RecipeError
+            The folder does not look like one of this kind.
+        """
+        from datagen.store.location import remove
+
+        self.require_kind()
+        if not self._is_ours():
+            raise RecipeError(
+                f"{self.path} holds files, but no {self.kind} of ours, so --fresh leaves it alone. Choose another --out"
+            )
+        remove(self.data)
+        super().remove()
+
+    def _is_ours(self) -> bool:
+        return self.recipe.exists() or not self.strangers()
+
+
+class SingleRunFolder(WorkflowFolder):
+    """The folder of ``workflows/full.py``: a dataset, and one training on it."""
+
+    run = _Entry("run", RunFolder)
+
+
+class TrialsFolder(WorkflowFolder):
+    """A folder of many trainings on one dataset."""
+
+    trials = _file("trials")
+    plan = _file("trials.yaml")
+    mark = _file(".sweep")
+
+    def _is_ours(self) -> bool:
+        return read_record(self.path) is not None or (not self.trials.exists() and super()._is_ours())
+
+
+class SweepFolder(TrialsFolder):
+    """The folder of a sweep."""
+
+    kind = "sweep"
+    table = _file("sweep.md")
+    csv = _file("sweep.csv")
+    figures = _file("figures")
+    best = _file("best.yaml")
+
+
+class ComparisonFolder(TrialsFolder):
+    """The folder of a comparison of methods."""
+
+    kind = "comparison"
+    evaluation = _Entry("evaluation", EvaluationFolder)
+
+
+class AblationFolder(ComparisonFolder):
+    """The folder of the ablations."""
+
+    kind = "ablation"
+
+
+def _matches(path: Path, names: tuple[str, ...]) -> bool:
+    return any(fnmatchcase(path.name, name) for name in names)
