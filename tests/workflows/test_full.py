@@ -21,6 +21,7 @@ from tests.support.files import tree_hash
 from training.checkpoints.checkpoint import require_checkpoint
 from training.tracking.journal import read_journal
 from training.tracking.record import read_record
+from workflows.pipeline.run_folder import SingleRunFolder
 from workflows.recipe.loader import load_recipe
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(400)]
@@ -112,6 +113,8 @@ def test_outputs_closing_words_and_records(undisturbed: Path) -> None:
     for name in ("rows.csv", "tables.md", "viewer.html", "figures/examples.png", "figures/training-curve.png"):
         assert (evaluation / name).stat().st_size > 500, name
     assert len(list((evaluation / "meshes").glob("*.glb"))) == 16
+    folder = SingleRunFolder(undisturbed)
+    assert not [each.strangers() for each in (folder, folder.run, folder.run.evaluation) if each.strangers()]
     for folder, kind in ((".", "workflow"), ("generate", "generate"), ("run", "train"), ("run/evaluation", "evaluate")):
         record = read_record(undisturbed / folder)
         assert record is not None and (record.kind, record.status) == (kind, "FINISHED")

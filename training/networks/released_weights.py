@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -21,6 +21,7 @@ from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 
 __all__ = [
+    "load_released",
     "load_released_corenet3d",
     "load_released_dsffnet",
     "load_released_npt",
@@ -49,6 +50,21 @@ _NPT = _SHARED | {f"block{i}": f"spadain_block{i}" for i in (1, 2, 3)} | {
 _ENCODER = ("encoder.conv1.weight", "encoder.conv2.weight", "encoder.conv3.weight")
 _DECODER = ("decoder.conv1.weight", "decoder.conv2.weight", "decoder.conv3.weight")
 _MOST_NAMED = 6
+
+
+def load_released(files: Sequence[Path], network: Mapping[str, Any]) -> nn.Module:
+    """Return the network that a recipe's section names (``name``, of NPT also ``variant``), with released weights.
+
+    Raises
+    ------
+    CheckpointError
+        See `load_released_dsffnet`.
+    """
+    if network["name"] == "corenet3d":
+        return load_released_corenet3d(*files)
+    if network["name"] == "npt":
+        return load_released_npt(*files, variant=network.get("variant", "maxpool"))
+    return load_released_dsffnet(*files)
 
 
 def load_released_dsffnet(released: Released, **options: Any) -> DSFFNet:

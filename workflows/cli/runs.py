@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from datagen.common.errors import DatasetError
+from datagen.common.errors import DatasetError, RecipeError
 from workflows.cli.declare import (
     Command,
     Parser,
@@ -105,6 +105,35 @@ def recipe_command(options: argparse.Namespace) -> None:
     print(yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False), end="")
 
 
+def _import_weights_options(made: Parser) -> None:
+    from training.recipes.training import NETWORK_NAMES
+
+    made.add_argument("network", choices=NETWORK_NAMES, help="whose they are")
+    made.add_argument("files", nargs="+", metavar="FILE", help="as published; of 3D-CoreNet *_net_G.pth *_net_Corr.pth")
+    made.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
+    made.add_argument("--variant", choices=("maxpool", "origin"), help="of npt: the script that trained it (maxpool)")
+
+
+def import_weights_command(options: argparse.Namespace) -> None:
+    """Write the authors' published weights as ours: a folder to name where a run or model is asked for."""
+    from training.checkpoints.folder import WEIGHTS, commit_into, weights_writer
+    from training.checkpoints.weights import fill_network
+    from training.inference.predict import network_from
+    from training.networks.released_weights import load_released
+    from training.recipes.training import TrainingRecipe
+
+    files = list(map(Path, options.files))
+    if len(files) != (2 if options.network == "corenet3d" else 1) or (options.variant and options.network != "npt"):
+        raise RecipeError("name one file, of corenet3d two (*_net_G.pth *_net_Corr.pth); --variant is for npt alone")
+    section = {"name": options.network} | ({"variant": options.variant} if options.variant else {})
+    recipe = TrainingRecipe.model_validate({"network": section})
+    weights = load_released(files, section).state_dict()
+    fill_network(network_from(recipe.network), weights, where=options.files[0])
+    about = {"step": 0, "recipe": recipe.model_dump(mode="json"), "dataset": ""}
+    commit_into(Path(options.out), about, {WEIGHTS: weights_writer(weights, about)})
+    print_text(f"written: {options.out}. Next: dsffnet transfer --model {shlex.quote(options.out)} ...")
+
+
 def _recorded(run: Path) -> list[Path]:
     """Folders in ``run``, it included, with a readable record; parents first."""
     from training.tracking.record import find_records, has_record
@@ -147,6 +176,14 @@ COMMANDS = (
         """\
   dsffnet sync runs/quickstart/run
   dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000""",
+    ),
+    Command(
+        import_weights_command,
+        _import_weights_options,
+        """\
+  dsffnet import-weights dsffnet saved_models/model_smpl.pth --out weights/dsffnet-smpl
+  dsffnet import-weights npt original_169.model --variant origin --out weights/npt
+  dsffnet import-weights corenet3d latest_net_G.pth latest_net_Corr.pth --out weights/corenet3d""",
     ),
     Command(
         recipe_command,

@@ -178,6 +178,7 @@ class WorkflowFolder(_Folder):
     kept = (*_Folder.kept, "mlflow.db*")
     recipe = _file("recipe.yaml")
     dataset = _file("dataset.zarr", kept=True)
+    dataset_lock = _file("dataset.zarr.lock", kept=True)
     generate = _file("generate")
     stages = _file("stages")
     report = _file("report.md")

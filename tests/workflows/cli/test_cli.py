@@ -2,10 +2,12 @@
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
@@ -15,6 +17,9 @@ from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
 from training.engine.trainer import train
+from training.inference.predict import load_trained
+from training.networks.npt import NPT
+from training.networks.released_weights import to_released_npt
 from workflows.pipeline.run_folder import SingleRunFolder
 
 
@@ -30,15 +35,34 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "leg.zarr", folder / "run"
 
 
+NAMES = (
+    "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
+    "sync", "import-weights", "recipe", "sweep", "compare", "ablation", "robustness", "generalisation", "transfer",
+    "submit", "ui",
+)  # fmt: skip
+
+
 def test_every_subcommand_has_help_with_an_example() -> None:
-    overview = command("--help").stdout
-    for name in (
-        "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
-        "transfer", "sync", "recipe",
-    ):  # fmt: skip
-        assert name in overview
-        assert f"dsffnet {name} " in command(name, "--help").stdout
+    overview = command("--help").stdout.split()
+    for name in NAMES:
+        assert name in overview and f"dsffnet {name}" in command(name, "--help").stdout.partition("examples:")[2]
     assert "training.learning_rate = 0.001" in command("train", "--help").stdout
+
+
+def test_parsers_import_nothing_heavy() -> None:
+    """By what they import, not by their time, which another program's load would change."""
+    code = (
+        "import sys; from workflows.cli.main import parsed\n"
+        "for name in sys.argv[1:]:\n"
+        "    try: parsed([name, '--help'] if name else ['--help'])\n"
+        "    except SystemExit: pass\n"
+        "heavy = {'torch', 'anny', 'ray', 'mlflow', 'trimesh', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "", *NAMES], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
@@ -99,6 +123,26 @@ def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Pa
     done = process("train", *recipe, *place, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
     assert done.returncode == 0 and "trained: " in done.stdout, done.stderr
     assert done.stderr.count("MLflow is not installed here") == 1 and "Traceback" not in done.stderr
+
+
+def test_published_weights_become_ours(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    dataset, source = open_dataset(str(trained[0])), NPT(variant="maxpool")
+    save_mesh(Mesh(dataset.vertices(3, 7), dataset.faces(3)), tmp_path / "a.obj")
+    torch.save(to_released_npt(source), tmp_path / "npt.model")
+    done = command("import-weights", "npt", tmp_path / "npt.model", "--out", tmp_path / "ours")
+    assert done.returncode == 0, done.stderr
+    loaded = load_trained(tmp_path / "ours")[0].state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in source.state_dict().items())
+    meshes = (tmp_path / "a.obj", tmp_path / "a.obj", "-o", tmp_path / "b.obj")
+    assert command("transfer", *meshes, "--model", tmp_path / "ours").returncode == 0
+    for words, says in (
+        (("dsffnet", tmp_path / "npt.model"), "48 more"),
+        (("corenet3d", tmp_path / "npt.model"), "of corenet3d two"),
+        (("npt", tmp_path / "none.model"), "none.model"),
+    ):
+        refused = command("import-weights", *words, "--out", tmp_path / "not")
+        fails(refused, 2 if "two" in says else 1, says)
+    assert not (tmp_path / "not").exists()
 
 
 def test_a_checkpoint_is_chosen(trained: tuple[Path, Path], tmp_path: Path) -> None:
