@@ -101,7 +101,13 @@ def _add_making(parser: Parser) -> None:
 
 
 def generate_command(options: argparse.Namespace) -> None:
-    """Make a dataset, or what is missing of one."""
+    """Make a dataset, or what is missing of one.
+
+    examples:
+      dsffnet generate --recipe quickstart --out data/quickstart.zarr
+      dsffnet generate --recipe quickstart --set data.identities.seed=7 --out data/custom.zarr
+      dsffnet generate --recipe data/custom.zarr --out data/custom-again.zarr
+    """
     from datagen.generate import generate
     from workflows.recipe.loader import load_recipe
 
@@ -112,7 +118,12 @@ def generate_command(options: argparse.Namespace) -> None:
 
 
 def append_command(options: argparse.Namespace) -> None:
-    """Give a dataset more identities or poses, up to these totals; nothing that is there is touched."""
+    """Give a dataset more identities or poses, up to these totals; nothing that is there is touched.
+
+    examples:
+      dsffnet append data/quickstart.zarr --training 24
+      dsffnet append data/quickstart.zarr --evaluation 12 --unseen 400
+    """
     from datagen.generate import append, grown_recipe
 
     totals = {name: getattr(options, name) for name in ("training", "evaluation", "seen", "unseen")}
@@ -126,7 +137,12 @@ def append_command(options: argparse.Namespace) -> None:
 
 
 def inspect_command(options: argparse.Namespace) -> None:
-    """Show what a dataset holds, at any status, and draw identities x poses."""
+    """Show what a dataset holds, at any status, and draw identities x poses.
+
+    examples:
+      dsffnet inspect data/quickstart.zarr
+      dsffnet inspect data/quickstart.zarr --picture sheet.png
+    """
     from datagen.store import open_dataset
     from datagen.store.verify import describe
     from training.reports.contact_sheet import draw_contact_sheet
@@ -140,7 +156,12 @@ def inspect_command(options: argparse.Namespace) -> None:
 
 
 def verify_command(options: argparse.Namespace) -> None:
-    """Check every shard; with --repair, make the faulty ones again."""
+    """Check every shard; with --repair, make the faulty ones again.
+
+    examples:
+      dsffnet verify data/quickstart.zarr
+      dsffnet verify data/quickstart.zarr --repair
+    """
     from datagen.generate import inline, repair
     from datagen.grid import Grid
     from datagen.store.verify import find_faults
@@ -185,7 +206,12 @@ def _own_recipe(url: str, overrides: Sequence[str]) -> "DatasetRecipe":
 
 
 def import_command(options: argparse.Namespace) -> None:
-    """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset."""
+    """Take meshes that exist already (FAUST, MultiGarment, NPT's layout) into a dataset.
+
+    examples:
+      dsffnet import faust FAUST/training/registrations --out data/faust.zarr
+      dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16
+    """
     from datagen.generate import generate
     from datagen.importers import found_recipe
     from workflows.recipe.loader import change_recipe, recipe_faults
@@ -215,7 +241,12 @@ def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def export_command(options: argparse.Namespace) -> None:
-    """Write a dataset's meshes as files: NPT's layout for peers' code, or GLB, OBJ, PLY for people."""
+    """Write a dataset's meshes as files: NPT's layout for peers' code, or GLB, OBJ, PLY for people.
+
+    examples:
+      dsffnet export data/quickstart.zarr --layout npt-obj --out exported
+      dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at
+    """
     from datagen.exporters import export_dataset
     from datagen.store import open_dataset
     from workflows.pipeline.progress import bar
@@ -234,14 +265,23 @@ def export_command(options: argparse.Namespace) -> None:
 
 
 def convert_body_command(options: argparse.Namespace) -> None:
-    """Write an original SMPL or SMAL file (a pickle) as plain arrays; nothing in it is executed."""
+    """Write an original SMPL or SMAL file (a pickle) as plain arrays; nothing in it is executed.
+
+    examples:
+      dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz
+    """
     from datagen.bodies.smpl_family.model_file import convert_model
 
     print_text(f"written: {convert_model(Path(options.model), Path(options.out))}")
 
 
 def stand_in_command(options: argparse.Namespace) -> None:
-    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, to try things out."""
+    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, to try things out.
+
+    examples:
+      dsffnet stand-in smpl --out standin.npz
+      dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr
+    """
     from datagen.bodies.standins.smpl_format import write_standin
 
     path = write_standin(options.kind, Path(options.out), topology=options.topology)
@@ -272,61 +312,12 @@ def _show(url: str) -> None:
 
 
 COMMANDS = (
-    Command(
-        generate_command,
-        declare_generate,
-        """\
-  dsffnet generate --recipe quickstart --out data/quickstart.zarr
-  dsffnet generate --recipe quickstart --set data.identities.seed=7 --out data/custom.zarr
-  dsffnet generate --recipe data/custom.zarr --out data/custom-again.zarr""",
-        takes_recipe=True,
-    ),
-    Command(
-        append_command,
-        declare_append,
-        """\
-  dsffnet append data/quickstart.zarr --training 24
-  dsffnet append data/quickstart.zarr --evaluation 12 --unseen 400""",
-    ),
-    Command(
-        inspect_command,
-        declare_inspect,
-        """\
-  dsffnet inspect data/quickstart.zarr
-  dsffnet inspect data/quickstart.zarr --picture sheet.png""",
-    ),
-    Command(
-        verify_command,
-        declare_verify,
-        """\
-  dsffnet verify data/quickstart.zarr
-  dsffnet verify data/quickstart.zarr --repair""",
-    ),
-    Command(
-        import_command,
-        declare_import,
-        """\
-  dsffnet import faust FAUST/training/registrations --out data/faust.zarr
-  dsffnet import npt smpl_data --out data/npt.zarr --set data.identities.training=16""",
-    ),
-    Command(
-        export_command,
-        declare_export,
-        """\
-  dsffnet export data/quickstart.zarr --layout npt-obj --out exported
-  dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at""",
-    ),
-    Command(
-        convert_body_command,
-        declare_convert,
-        """\
-  dsffnet convert-body basicModel_neutral_lbs_10_207_0_v1.0.0.pkl --out SMPL_NEUTRAL.npz""",
-    ),
-    Command(
-        stand_in_command,
-        declare_stand_in,
-        """\
-  dsffnet stand-in smpl --out standin.npz
-  dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr""",
-    ),
+    Command(generate_command, declare_generate, takes_recipe=True),
+    Command(append_command, declare_append),
+    Command(inspect_command, declare_inspect),
+    Command(verify_command, declare_verify),
+    Command(import_command, declare_import),
+    Command(export_command, declare_export),
+    Command(convert_body_command, declare_convert),
+    Command(stand_in_command, declare_stand_in),
 )

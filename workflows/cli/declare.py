@@ -1,9 +1,10 @@
-"""How subcommands of ``dsffnet`` are declared: a function, its options, its examples; and options that several share.
+"""How subcommands of ``dsffnet`` are declared: a function and its options; and options that several share.
 
 Declaring imports nothing heavy: what a command needs is imported when it runs, and its options when it is asked for.
 """
 
 import argparse
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,11 +16,10 @@ _WORDS = ("result", "latest", "best")
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand: ``NAME_command``, described by its docstring; with ``takes_recipe`` its help lists all keys."""
+    """A subcommand: ``NAME_command``, whose docstring is its help; with ``takes_recipe`` that lists all keys, too."""
 
     run: Callable[[argparse.Namespace], None]
     add_options: Callable[[Parser], None]
-    examples: str
     takes_recipe: bool = False
 
     @property
@@ -28,21 +28,18 @@ class Command:
         return self.run.__name__.removesuffix("_command").replace("_", "-")
 
     def add_to(self, commands: "argparse._SubParsersAction[Parser]", *, whole: bool) -> None:
-        """Declare the subcommand; ``whole``: with its options and epilog, not only its name."""
-        text = self.run.__doc__ or ""
+        """Declare the subcommand; ``whole``: with its options and all of its help, not only its name."""
+        text = inspect.getdoc(self.run) or ""
         made = commands.add_parser(
             self.name,
             help=text.split("\n")[0],
             description=text,
-            epilog=self._epilog() if whole else None,
+            epilog=recipe_keys() if whole and self.takes_recipe else None,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         made.set_defaults(command=self.run)
         if whole:
             self.add_options(made)
-
-    def _epilog(self) -> str:
-        return f"examples:\n{self.examples}" + (f"\n\n{recipe_keys()}" if self.takes_recipe else "")
 
 
 def recipe_keys() -> str:

@@ -28,7 +28,12 @@ def _train_options(made: Parser) -> None:
 
 
 def train_command(options: argparse.Namespace) -> None:
-    """Train on a dataset into a run folder, or resume a training."""
+    """Train on a dataset into a run folder, or resume a training.
+
+    examples:
+      dsffnet train --recipe quickstart --data data/quickstart.zarr --out runs/first
+      dsffnet train --recipe quickstart --set training.steps=8000 --data data/quickstart.zarr --out runs/longer
+    """
     from datagen.store import open_dataset
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import RunFolder
@@ -59,7 +64,13 @@ def _evaluate_options(made: Parser) -> None:
 
 
 def evaluate_command(options: argparse.Namespace) -> None:
-    """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run."""
+    """Measure a run on a dataset's evaluation triples; tables, figures, meshes and viewer go into the run.
+
+    examples:
+      dsffnet evaluate runs/first --data data/quickstart.zarr
+      dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
+      dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024
+    """
     from datagen.store import open_dataset
     from training.tracking.record import has_record
     from workflows.pipeline.evaluate import evaluate_weights
@@ -83,7 +94,12 @@ def _sync_options(made: Parser) -> None:
 
 
 def sync_command(options: argparse.Namespace) -> None:
-    """Send to MLflow what an outage kept back; repeating it changes nothing."""
+    """Send to MLflow what an outage kept back; repeating it changes nothing.
+
+    examples:
+      dsffnet sync runs/quickstart/run
+      dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000
+    """
     from training.tracking.mlflow_mirror import publish
 
     run = Path(options.run)
@@ -96,7 +112,13 @@ def sync_command(options: argparse.Namespace) -> None:
 
 
 def recipe_command(options: argparse.Namespace) -> None:
-    """Print a resolved recipe as YAML."""
+    """Print a resolved recipe as YAML.
+
+    examples:
+      dsffnet recipe --recipe quickstart
+      dsffnet recipe --recipe mine.yaml --set training.batch=16
+      dsffnet recipe --set training=npt-paper training.steps=100
+    """
     import yaml
 
     from workflows.recipe.loader import load_recipe
@@ -115,10 +137,16 @@ def _import_weights_options(made: Parser) -> None:
 
 
 def import_weights_command(options: argparse.Namespace) -> None:
-    """Write the authors' published weights as ours: a folder to name where a run or model is asked for."""
+    """Write the authors' published weights as ours: a folder to name where a run or model is asked for.
+
+    examples:
+      dsffnet import-weights dsffnet saved_models/model_smpl.pth --out weights/dsffnet-smpl
+      dsffnet import-weights npt original_169.model --variant origin --out weights/npt
+      dsffnet import-weights corenet3d latest_net_G.pth latest_net_Corr.pth --out weights/corenet3d
+    """
     from training.checkpoints.folder import WEIGHTS, commit_into, weights_writer
     from training.checkpoints.weights import fill_network
-    from training.inference.predict import network_from
+    from training.networks import network_from
     from training.networks.released_weights import load_released
     from training.recipes.training import TrainingRecipe
 
@@ -153,45 +181,9 @@ def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
 
 
 COMMANDS = (
-    Command(
-        train_command,
-        _train_options,
-        """\
-  dsffnet train --recipe quickstart --data data/quickstart.zarr --out runs/first
-  dsffnet train --recipe quickstart --set training.steps=8000 --data data/quickstart.zarr --out runs/longer""",
-        takes_recipe=True,
-    ),
-    Command(
-        evaluate_command,
-        _evaluate_options,
-        """\
-  dsffnet evaluate runs/first --data data/quickstart.zarr
-  dsffnet evaluate runs/first --data data/quickstart.zarr --checkpoint best
-  dsffnet evaluate runs/first --data data/custom.zarr --set evaluation.emd_points=1024""",
-        takes_recipe=True,
-    ),
-    Command(
-        sync_command,
-        _sync_options,
-        """\
-  dsffnet sync runs/quickstart/run
-  dsffnet sync runs/quickstart --tracking-uri http://127.0.0.1:5000""",
-    ),
-    Command(
-        import_weights_command,
-        _import_weights_options,
-        """\
-  dsffnet import-weights dsffnet saved_models/model_smpl.pth --out weights/dsffnet-smpl
-  dsffnet import-weights npt original_169.model --variant origin --out weights/npt
-  dsffnet import-weights corenet3d latest_net_G.pth latest_net_Corr.pth --out weights/corenet3d""",
-    ),
-    Command(
-        recipe_command,
-        add_recipe_options,
-        """\
-  dsffnet recipe --recipe quickstart
-  dsffnet recipe --recipe mine.yaml --set training.batch=16
-  dsffnet recipe --set training=npt-paper training.steps=100""",
-        takes_recipe=True,
-    ),
+    Command(train_command, _train_options, takes_recipe=True),
+    Command(evaluate_command, _evaluate_options, takes_recipe=True),
+    Command(sync_command, _sync_options),
+    Command(import_weights_command, _import_weights_options),
+    Command(recipe_command, add_recipe_options, takes_recipe=True),
 )

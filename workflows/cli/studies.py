@@ -95,12 +95,21 @@ def _comparison_options(made: Parser, kind: Kind) -> None:
 
 
 def compare_command(options: argparse.Namespace) -> None:
-    """Train DSFFNet, NPT and 3D-CoreNet under one budget on one dataset: Tables 1 and 2, Figure 4, a report."""
+    """Train DSFFNet, NPT and 3D-CoreNet under one budget on one dataset: Tables 1 and 2, Figure 4, a report.
+
+    examples:
+      dsffnet compare --out runs/compare
+      dsffnet compare --recipe animals-small --set training.steps=500
+    """
     _compare(options, "comparison")
 
 
 def ablation_command(options: argparse.Namespace) -> None:
-    """Train DSFFNet and its ablations under one budget on one dataset: Table 3, its figure, a report."""
+    """Train DSFFNet and its ablations under one budget on one dataset: Table 3, its figure, a report.
+
+    examples:
+      dsffnet ablation --out runs/ablation
+    """
     _compare(options, "ablation")
 
 
@@ -162,7 +171,11 @@ def _sweep_options(made: Parser) -> None:
 
 
 def sweep_command(options: argparse.Namespace) -> None:
-    """Train many recipes on one dataset, and report which learned best."""
+    """Train many recipes on one dataset, and report which learned best.
+
+    examples:
+      dsffnet sweep --trials networks --out runs/networks
+    """
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import SweepFolder
     from workflows.sweep.plan import plan_sweep
@@ -220,7 +233,13 @@ def _robustness_options(made: Parser) -> None:
 
 
 def robustness_command(options: argparse.Namespace) -> None:
-    """Disturb the source (noise, missing parts, other sampling, rotation) and measure what comes out."""
+    """Disturb the source (noise, missing parts, other sampling, rotation) and measure what comes out.
+
+    examples:
+      dsffnet robustness runs/quickstart/run --data runs/quickstart/dataset.zarr
+      dsffnet robustness runs/dsffnet runs/npt runs/corenet3d --data X.zarr --out runs/robustness
+      dsffnet robustness RUN --data X.zarr --only noise patch --triples 100
+    """
     from workflows.studies.robustness import robustness_command as run
 
     run(options)
@@ -253,42 +272,22 @@ def _generalisation_options(made: Parser) -> None:
 
 
 def generalisation_command(options: argparse.Namespace) -> None:
-    """Transfer between bodies and vertex counts that the weights were not trained on, and measure it."""
+    """Transfer between bodies and vertex counts that the weights were not trained on, and measure it.
+
+    examples:
+      dsffnet generalisation runs/quickstart/run
+      dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
+      dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr
+    """
     from workflows.studies.generalisation import generalisation_command as run
 
     run(options)
 
 
 COMMANDS = (
-    Command(
-        sweep_command,
-        _sweep_options,
-        "  dsffnet sweep --trials networks --out runs/networks",
-        takes_recipe=True,
-    ),
-    Command(
-        compare_command,
-        _compare_options,
-        """\
-  dsffnet compare --out runs/compare
-  dsffnet compare --recipe animals-small --set training.steps=500""",
-        takes_recipe=True,
-    ),
-    Command(ablation_command, _ablation_options, "  dsffnet ablation --out runs/ablation", takes_recipe=True),
-    Command(
-        robustness_command,
-        _robustness_options,
-        """\
-  dsffnet robustness runs/quickstart/run --data runs/quickstart/dataset.zarr
-  dsffnet robustness runs/dsffnet runs/npt runs/corenet3d --data X.zarr --out runs/robustness
-  dsffnet robustness RUN --data X.zarr --only noise patch --triples 100""",
-    ),
-    Command(
-        generalisation_command,
-        _generalisation_options,
-        """\
-  dsffnet generalisation runs/quickstart/run
-  dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
-  dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr""",
-    ),
+    Command(sweep_command, _sweep_options, takes_recipe=True),
+    Command(compare_command, _compare_options, takes_recipe=True),
+    Command(ablation_command, _ablation_options, takes_recipe=True),
+    Command(robustness_command, _robustness_options),
+    Command(generalisation_command, _generalisation_options),
 )

@@ -33,7 +33,12 @@ class Job(Protocol):
 
 
 def submit_command(options: argparse.Namespace) -> None:
-    """Run a command as a Ray job, show its log, and end with status 0 only if the job succeeded."""
+    """Run a command as a Ray job, show its log, and end with status 0 only if the job succeeded.
+
+    examples:
+      dsffnet submit -- python workflows/full.py --out /shared/runs/quickstart
+      dsffnet submit --address http://HEAD:8265 -- dsffnet train --data /shared/x.zarr --out /shared/runs/first
+    """
     job = submitted(options.entrypoint, options.address, options.working_dir)
     print(f"submitted: job {job.name}", flush=True)
     try:
@@ -180,10 +185,4 @@ def _submit_options(made: Parser) -> None:
     made.add_argument("entrypoint", nargs="+", metavar="COMMAND", help="behind --, e.g. -- python workflows/full.py")
 
 
-COMMAND = Command(
-    submit_command,
-    _submit_options,
-    """\
-  dsffnet submit -- python workflows/full.py --out /shared/runs/quickstart
-  dsffnet submit --address http://HEAD:8265 -- dsffnet train --data /shared/x.zarr --out /shared/runs/first""",
-)
+COMMAND = Command(submit_command, _submit_options)

@@ -51,7 +51,14 @@ def _add_extras(made: Parser) -> None:
 
 
 def transfer_command(options: argparse.Namespace) -> None:
-    """Pose one mesh like another, or like each of a sequence."""
+    """Pose one mesh like another, or like each of a sequence.
+
+    examples:
+      dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
+      dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
+      dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
+      dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine
+    """
     from workflows.transfer.job import TransferJob
 
     job = TransferJob.from_options(options)
@@ -108,12 +115,4 @@ def _rate(word: str) -> float:
     return value
 
 
-COMMAND = Command(
-    transfer_command,
-    _transfer_options,
-    """\
-  dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
-  dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
-  dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
-  dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine""",
-)
+COMMAND = Command(transfer_command, _transfer_options)

@@ -22,7 +22,12 @@ class PageError(DsffnetError):
 
 
 def ui_command(options: argparse.Namespace) -> None:
-    """Show a folder's MLflow store in the browser, until Ctrl-C or the end of the shell or make that started this."""
+    """Show a folder's MLflow store in the browser, until Ctrl-C or the end of the shell or make that started this.
+
+    examples:
+      dsffnet ui
+      dsffnet ui runs/custom --port 5001
+    """
     database = Path(options.out).absolute() / "mlflow.db"
     if not database.is_file():
         raise DatasetError(
@@ -89,10 +94,4 @@ def _ui_options(made: Parser) -> None:
     made.add_argument("--port", type=int, default=5000, help="of 127.0.0.1 (default: %(default)s)")
 
 
-COMMAND = Command(
-    ui_command,
-    _ui_options,
-    """\
-  dsffnet ui
-  dsffnet ui runs/custom --port 5001""",
-)
+COMMAND = Command(ui_command, _ui_options)
