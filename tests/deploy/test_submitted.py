@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.cluster, pytest.mark.timeout(400)]
 WAITING = ("python", "-c", "import time; print('at work', flush=True); time.sleep(300)")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def head() -> Iterator[Stack]:
     with services_running(["ray-head"]) as running:
         yield running
@@ -67,7 +67,7 @@ def test_the_status_is_the_job_s(head: Stack) -> None:
 
 
 def test_sigkill_of_the_head_s_raylet(head: Stack) -> None:
-    """Where ``ray job submit`` ends with status 0."""
+    """Where ``ray job submit`` ends with status 0. The last test: the head is of no use afterwards."""
     process = start(head, *WAITING)
     driver = at_work(process)
     raylets = [p for p in head.leftovers() if p.name() == "raylet"]
