@@ -5,7 +5,7 @@
     python workflows/full.py --set training.steps=8000 --out runs/longer
     ray job submit --working-dir . -- python workflows/full.py --out /data/runs/quickstart
 
-Run the same command again to go on from where it was; finished stages are skipped.
+Run the same command again to resume; finished stages are skipped.
 """
 
 import os
@@ -175,7 +175,7 @@ Try next
 
 
 def _programs() -> str:
-    """Folder of this environment's programs with a slash behind it, or nothing where the shell finds them anyway."""
+    """Folder of this environment's programs with a slash after it, or nothing where the shell finds them anyway."""
     here = Path(sys.executable).parent
     if shutil.which("dsffnet") == str(here / "dsffnet"):
         return ""

@@ -298,7 +298,7 @@ def test_nothing_of_ray_outlives_a_driver_that_is_ended_while_it_trains(tmp_path
         output, _ = process.communicate(timeout=90)
         assert process.returncode == status, output
         if status > 0:
-            assert output.splitlines()[-1].endswith("run the same command again to go on from here"), output
+            assert output.splitlines()[-1].endswith("run the same command again to resume"), output
         wait_until_gone(rays)
 
 

@@ -53,7 +53,7 @@ def note_sent(folder: Path, uri: str, sent: dict[str, Any]) -> None:
 
 
 def unsent_rows(folder: Path, offsets: dict[str, int], *, values: int) -> Iterator[tuple[str, int, MetricRows]]:
-    """Journal rows behind the noted offsets: name of the journal, offset behind the rows, rows of about so many values.
+    """Journal rows after the noted offsets: name of the journal, offset after the rows, rows of about so many values.
 
     A journal that is shorter than its offset was put back from elsewhere, and is read from its beginning.
     """
@@ -61,9 +61,9 @@ def unsent_rows(folder: Path, offsets: dict[str, int], *, values: int) -> Iterat
         offset = offsets.get(path.name, 0)
         rows: MetricRows = []
         held = 0
-        for behind, row in journal_from(path, offset if offset <= path.stat().st_size else 0):
+        for after, row in journal_from(path, offset if offset <= path.stat().st_size else 0):
             rows.append(row)
-            held, offset = held + len(row), behind
+            held, offset = held + len(row), after
             if held >= values:
                 yield path.name, offset, rows
                 rows, held = [], 0
@@ -72,7 +72,7 @@ def unsent_rows(folder: Path, offsets: dict[str, int], *, values: int) -> Iterat
 
 
 def unsent_artifacts(folder: Path, relatives: list[str], stamps: dict[str, str]) -> Iterator[tuple[Path, str, str]]:
-    """Files that are new or have changed: path, name in the record's folder, stamp of its looks.
+    """Files that are new or have changed: path, name in the record's folder, stamp of its signature.
 
     What a name or a link leads to outside the folder is left out, with a warning; so is what is no regular file.
     """

@@ -1,7 +1,7 @@
 """The MLflow mirror of records (see :mod:`training.tracking.record`): the one place that talks to MLflow.
 
 ``publish`` can be repeated at any time, after any outage or kill: what has been sent is noted in FOLDER/mlflow.json
-behind every call. What is sent twice all the same is there once: MLflow stores the same point (metric, step, time,
+after every call. What is sent twice all the same is there once: MLflow stores the same point (metric, step, time,
 value) once, and runs and models bear the record's id, by which they are found before they are made a second time.
 """
 

@@ -73,7 +73,7 @@ def follow(job: Job, *, look: float = _LOOK_SECONDS, lost: float = _LOST_SECONDS
         if time.monotonic() - seen > lost:
             raise ClusterError(
                 f"job {job.name} is lost: {trouble}, for {lost:.0f} s now. When the cluster is well again, submit the "
-                "same command: it goes on from what is complete"
+                "same command: it resumes from what is complete"
             )
         time.sleep(look)
 
@@ -82,7 +82,7 @@ def _require_success(name: str, info: Any) -> None:
     if info.status == "SUCCEEDED":
         return
     if info.status == "STOPPED":
-        raise ClusterError(f"job {name} was stopped. Submit the same command to go on")
+        raise ClusterError(f"job {name} was stopped. Submit the same command to resume")
     told = (info.message or "no reason is known").strip().splitlines()[0]
     how = f"its command ended with status {info.driver_exit_code}" if info.driver_exit_code else told
     raise ClusterError(f"job {name} failed: {how}. Its log: ray job logs {name}")
@@ -130,7 +130,7 @@ class RayJob:
         return any(each.node_id == node and each.state == "ALIVE" for each in nodes)
 
     def print_log(self, over: threading.Event) -> None:
-        """Print the log until the job is over; where the connection breaks, go on after what was printed."""
+        """Print the log until the job is over; where the connection breaks, resume after what was printed."""
         while True:
             last = over.is_set()
             with suppress(Exception):  # the log is a courtesy: what the job came to is asked elsewhere
@@ -182,7 +182,7 @@ def _submit_options(made: Parser) -> None:
         metavar="DIR",
         help="whose files the job runs in a copy of, but for what .gitignore names (default: here)",
     )
-    made.add_argument("entrypoint", nargs="+", metavar="COMMAND", help="behind --, e.g. -- python workflows/full.py")
+    made.add_argument("entrypoint", nargs="+", metavar="COMMAND", help="after --, e.g. -- python workflows/full.py")
 
 
 COMMAND = Command(submit_command, _submit_options)

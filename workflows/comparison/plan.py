@@ -13,14 +13,10 @@ from datagen.common.printable import printable
 from datagen.recipe import Frozen
 from datagen.recipe.text import faults_text, read_values
 from workflows.recipe.loader import WorkflowRecipe
-from workflows.recipe.names import nearest
+from workflows.recipe.names import file_of, known_files
 from workflows.sweep.plan import Sweep, Trial, TrialEntry, resolve
 
 Kind = Literal["comparison", "ablation"]
-_FOLDERS: dict[Kind, Path] = {
-    "comparison": Path(__file__).parents[1] / "recipes" / "comparisons",
-    "ablation": Path(__file__).parents[1] / "recipes" / "ablations",
-}
 
 
 class MethodEntry(Frozen):
@@ -63,7 +59,7 @@ class ComparisonPlan:
 
 def known_comparisons(kind: Kind) -> dict[str, Path]:
     """Comparisons of a kind that come with the project, by name."""
-    return {path.stem: path for path in sorted(_FOLDERS[kind].glob("*.yaml"))}
+    return known_files(f"{kind}s")
 
 
 def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: Kind) -> ComparisonPlan:
@@ -83,7 +79,7 @@ def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: Kind
     RecipeError
         No such comparison, not YAML, a key that is not there, a value that cannot be, two methods of one name.
     """
-    path = _find(name_or_file, kind)
+    path = file_of(name_or_file, known_comparisons(kind), what=kind)
     file, words = _read(path), tuple(shared)
     entries = [TrialEntry(name=_folder(m.name), description=m.description, set=m.set) for m in file.methods]
     sweep = resolve(entries, recipe=file.recipe, words=(*file.set, *words))
@@ -93,17 +89,6 @@ def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: Kind
 
 def _folder(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9.=+]+", "-", name).strip("-.=+") or "method"
-
-
-def _find(name_or_file: str, kind: Kind) -> Path:
-    known = known_comparisons(kind)
-    path = known.get(name_or_file, Path(name_or_file))
-    if path.suffix not in (".yaml", ".yml"):
-        raise RecipeError(
-            f"no {kind} {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}, "
-            "or give a YAML file"
-        )
-    return path
 
 
 def _read(path: Path) -> ComparisonFile:

@@ -49,7 +49,7 @@ def run_comparison(
         judge(outcomes, of=len(plan.methods), strict=True)
         evaluate = Stage(
             "evaluate",
-            depends_on=[_learned(plan), weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
+            depends_on=[_trainings(plan), weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
             intact=lambda: intact(folder.evaluation) and has_record(folder.evaluation.path),
             work=lambda: _evaluate(plan, folder, runs),
         )
@@ -62,7 +62,7 @@ def run_comparison(
     run_trials(work, runner=ray_trials, finish=finish)
 
 
-def _learned(plan: ComparisonPlan) -> dict[str, object]:
+def _trainings(plan: ComparisonPlan) -> dict[str, object]:
     return {name: trial.training.model_dump(mode="json") for name, trial in plan.methods.items()}
 
 

@@ -21,7 +21,7 @@ _LESS = "lower counts, vertices, training.batch or widths"
 
 
 def guarded(main: Callable[[], None]) -> None:
-    """Run a command; what a person can mend becomes one line on standard error and an exit status.
+    """Run a command; what a person can repair becomes one line on standard error and an exit status.
 
     What the terminal's encoding lacks is written with escapes.
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop,
@@ -35,7 +35,7 @@ def guarded(main: Callable[[], None]) -> None:
     except DsffnetError as error:
         _fail(str(error), error.exit_status)
     except KeyboardInterrupt as interrupt:
-        what_next = str(interrupt) or "run the same command again to go on from here"
+        what_next = str(interrupt) or "run the same command again to resume"
         print(f"{'stopped' if told else 'interrupted'}; {what_next}", file=sys.stderr)
         sys.exit(128 + (told[0] if told else signal.SIGINT))
     except UnicodeEncodeError as error:
@@ -43,7 +43,7 @@ def guarded(main: Callable[[], None]) -> None:
         _fail(f"{error.object[:300]!r} is not UTF-8 text, which a name must be here. Rename it")
     except OSError as error:
         log.debug("as raised", exc_info=True)
-        _fail(f"{error}. Nothing that was complete is lost; mend this and run again")
+        _fail(f"{error}. Nothing that was complete is lost; repair this and run again")
     except Exception as error:
         if not ran_out_of_memory(error):
             raise
@@ -71,7 +71,7 @@ def _heed_signals() -> list[int]:
 
 
 def _require_text(words: Sequence[str]) -> None:
-    """Refuse names that a shell whose encoding is not UTF-8 cannot say: Ray, MLflow and records would write others."""
+    """Refuse names that this shell's encoding lacks: Ray, MLflow and records would write others."""
     encoding = sys.getfilesystemencoding()
     unreadable = [word for word in (*words, os.getcwd()) if any("\udc80" <= letter <= "\udcff" for letter in word)]
     if unreadable and encoding != "utf-8":

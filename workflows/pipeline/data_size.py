@@ -1,4 +1,4 @@
-"""What a dataset will take, said before it is made; one that memory or the disk has no room for is refused."""
+"""What a dataset will take, reported before it is made; one that memory or the disk has no room for is refused."""
 
 import os
 

@@ -19,7 +19,7 @@ from workflows.pipeline.stage import Stage, recorded
 from workflows.pipeline.tasks import TaskRunner
 
 CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
-"""Attributes that tell a dataset from all others, wherever it lies."""
+"""Attributes that identify a dataset, wherever it lies."""
 
 
 def generate_stage(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> Stage:

@@ -192,7 +192,7 @@ class _Watch:
     def message(self) -> str:
         return (
             f"Ray's {self.lost} has died (killed, or out of memory). What was complete is kept: run the same command "
-            "again to go on from here"
+            "again to resume"
         )
 
     def run(self, stop: threading.Event) -> None:

@@ -81,9 +81,9 @@ class _Follower:
 
     def _read(self, *, past: bool = False) -> bool:
         before = self._offset
-        for behind, row in journal_from(self._journal, before):
+        for after, row in journal_from(self._journal, before):
             self._progress.add(row, past=past)
-            self._offset = behind
+            self._offset = after
         return self._offset > before
 
 

@@ -101,21 +101,13 @@ class EvaluationFolder(_Folder):
     viewer = _file("viewer.html")
     inference = _file("inference.json")
     figures = _file("figures")
+    examples = _file("figures/examples.png")
+    curve = _file("figures/training-curve.png")
     meshes = _file("meshes")
     measured = _file("measured")
     chunks = _file("chunks")
     robustness = _file("robustness")
     generalisation = _file("generalisation")
-
-    @property
-    def examples(self) -> Path:
-        """The figure of examples."""
-        return self.figures / "examples.png"
-
-    @property
-    def curve(self) -> Path:
-        """The training curve, with the errors of the no-op baselines."""
-        return self.figures / "training-curve.png"
 
 
 class RunFolder(_Folder):
@@ -129,6 +121,8 @@ class RunFolder(_Folder):
     latest = _file("latest")
     best = _file("best")
     figures = _file("figures")
+    curve = _file("figures/training-curve.png")
+    coefficients = _file("figures/adaptive-coefficients.png")
     pictures = _file("pictures")
     input = _file("input.json")
     stop = _file("stop")
@@ -139,16 +133,6 @@ class RunFolder(_Folder):
     ray = _file("ray")
     evaluation = _Entry("evaluation", EvaluationFolder)
     lock = _file(".driver.lock", kept=True)
-
-    @property
-    def curve(self) -> Path:
-        """The training curve."""
-        return self.figures / "training-curve.png"
-
-    @property
-    def coefficients(self) -> Path:
-        """The adaptive coefficients over training."""
-        return self.figures / "adaptive-coefficients.png"
 
     def remove(self) -> None:
         """Remove what a training keeps in its folder.

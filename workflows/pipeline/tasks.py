@@ -66,7 +66,7 @@ class TaskRunner:
         return recipe.model_copy(update={"launcher": "inline" if alone else "ray"})
 
     def _decide(self, what: str, amount: int, unit: str, least: int) -> bool:
-        """Whether work is done here, said in one line."""
+        """Whether work is done here, reported in one line."""
         here = self._local or (amount < least and not on_cluster())
         where = "in this process" if here else "on Ray"
         why = "--local" if self._local else "a cluster" if on_cluster() else f"Ray from {least:,}"

@@ -84,7 +84,7 @@ def train_run(recipe: TrainingRecipe, dataset: Dataset, run: RunFolder) -> None:
     reached, last = require_checkpoint(run.path), last_step_of(recipe, dataset)
     if not is_finished(reached, last):
         raise TrainingError(
-            f"training in {run.path} ended at step {reached.step} of {last}. Run the same command again to go on"
+            f"training in {run.path} ended at step {reached.step} of {last}. Run the same command again to resume"
         )
     draw_training_curve(run.path, run.curve, baselines={})
 

@@ -50,20 +50,6 @@ def _absolute(value: Any, folder: Path, always: bool) -> Any:
     return str((folder / path).resolve())
 
 
-__all__ = [
-    "WorkflowRecipe",
-    "change_recipe",
-    "check_recipe",
-    "describe_fields",
-    "known_recipes",
-    "load_recipe",
-    "override_values",
-    "recipe_faults",
-    "save_recipe",
-    "with_absolute_paths",
-]
-
-
 class WorkflowRecipe(Frozen):
     """Everything that a workflow does, apart from where its files go."""
 
@@ -110,7 +96,11 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     values = with_absolute_paths(_with_training(values, name), folder)
     here = Path.cwd()
     words = [(key, with_absolute_paths({(last := key.rsplit(".", 1)[-1]): value}, here)[last]) for key, value in words]
-    return check_recipe(changed(values, words, kinds=_KINDS), where=where)
+    values = changed(values, words, kinds=_KINDS)
+    if not values:
+        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
+    with recipe_faults(where):
+        return WorkflowRecipe.model_validate(values)
 
 
 def override_values(overrides: Sequence[str]) -> dict[str, Any]:
@@ -136,20 +126,6 @@ def _with_training(values: dict[str, Any], name: str | None) -> dict[str, Any]:
     if name is None and isinstance(values.get("training"), str):
         name = values["training"]
     return values if name is None else {**values, "training": named_training(name)}
-
-
-def check_recipe(values: Any, *, where: str) -> WorkflowRecipe:
-    """A recipe from nested values.
-
-    Raises
-    ------
-    RecipeError
-        With one line a fault: which key, what is wrong, what was given.
-    """
-    if not isinstance(values, dict) or not values:
-        raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
-    with recipe_faults(where):
-        return WorkflowRecipe.model_validate(values)
 
 
 @contextmanager

@@ -10,14 +10,36 @@ from datagen.recipe.text import read_values
 _FOLDER = Path(__file__).parents[1] / "recipes"
 
 
+def known_files(kind: str = "") -> dict[str, Path]:
+    """Files that come with the project, by name: of whole recipes, or those in the folder of a ``kind``."""
+    return {path.stem: path for path in sorted((_FOLDER / kind).glob("*.yaml"))}
+
+
 def known_recipes() -> dict[str, Path]:
     """Files of whole recipes, by name."""
-    return _files(_FOLDER)
+    return known_files()
 
 
 def known_trainings() -> dict[str, Path]:
     """Files of published training recipes, by name: ``training: NAME`` means what one says in that section."""
-    return _files(_FOLDER / "training")
+    return known_files("training")
+
+
+def file_of(name_or_file: str, known: dict[str, Path], *, what: str) -> Path:
+    """The known file of that name, or the YAML file itself.
+
+    Raises
+    ------
+    RecipeError
+        There is none of that name, and it is no name of a YAML file; the nearest and all others are named.
+    """
+    path = known.get(name_or_file, Path(name_or_file))
+    if path.suffix not in (".yaml", ".yml"):
+        raise RecipeError(
+            f"no {what} {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}, "
+            "or give a YAML file"
+        )
+    return path
 
 
 def named_training(name: str) -> dict[str, Any]:
@@ -38,7 +60,3 @@ def nearest(name: str, known: list[str]) -> str:
     """Words that suggest the known name nearest to one that is not, or none."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
     return f", did you mean {close[0]!r}?" if close else ""
-
-
-def _files(folder: Path) -> dict[str, Path]:
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}

@@ -1,6 +1,5 @@
 """What a sweep tries: the grid of varied values, or a file of named trials; every one of them a recipe of its own."""
 
-import difflib
 import itertools
 import math
 import re
@@ -20,6 +19,7 @@ from datagen.recipe.text import faults_text, read_values
 from training.recipes.training import TrainingRecipe
 from training.tracking.record import flatten
 from workflows.recipe.loader import WorkflowRecipe, load_recipe
+from workflows.recipe.names import file_of, known_files
 
 _OPENING, _CLOSING = "[{(", "]})"
 
@@ -78,7 +78,6 @@ def in_a_name(value: str) -> str:
     return re.sub(r"[^A-Za-z0-9._+-]+", "-", value).strip("-") or "-"
 
 
-_FOLDER = Path(__file__).parents[1] / "recipes" / "sweeps"
 _MOST_TRIALS = 10_000
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=+-]{0,99}")
 
@@ -138,7 +137,7 @@ class Sweep:
 
 def known_sweeps() -> dict[str, Path]:
     """Sweeps that come with the project, by name."""
-    return {path.stem: path for path in sorted(_FOLDER.glob("*.yaml"))}
+    return known_files("sweeps")
 
 
 def plan_sweep(
@@ -193,13 +192,7 @@ def read_sweep(name_or_file: str) -> SweepFile:
     RecipeError
         No such sweep, not YAML, or not a list of trials.
     """
-    path = known_sweeps().get(name_or_file, Path(name_or_file))
-    if path.suffix not in (".yaml", ".yml"):
-        nearest = difflib.get_close_matches(name_or_file, known_sweeps(), n=1, cutoff=0.4)
-        hint = f", did you mean {nearest[0]!r}?" if nearest else ""
-        raise RecipeError(
-            f"no sweep {name_or_file!r}{hint}; there are {', '.join(known_sweeps())}, or give a YAML file"
-        )
+    path = file_of(name_or_file, known_sweeps(), what="sweep")
     values = read_values(path)
     try:
         return SweepFile.model_validate({"trials": values} if isinstance(values, list) else values)

@@ -53,7 +53,7 @@ class SweepProgress:
             self._said = time.monotonic()
             say(f"sweep: {self.summary()}")
 
-    def tell(self, outcome: Outcome) -> None:
+    def report(self, outcome: Outcome) -> None:
         """Say in a line how a trial ended."""
         self._read()
         self._ended.add(outcome.name)
@@ -78,8 +78,8 @@ class SweepProgress:
 
     def _read(self) -> None:
         for name, path in self._journals.items():
-            for behind, row in journal_from(path, self._offsets[name]):
-                self._offsets[name] = behind
+            for after, row in journal_from(path, self._offsets[name]):
+                self._offsets[name] = after
                 self._latest[name] |= row
 
 

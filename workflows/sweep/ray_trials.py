@@ -1,6 +1,6 @@
 """Running trials: the task that trains one, and the Ray cluster that runs as many at once as there are CPUs for.
 
-A task may be started more than once (Ray repeats those whose worker or node died); each start goes on from the newest
+A task may be started more than once (Ray repeats those whose worker or node died); each start resumes from the newest
 checkpoint, so that nothing is done twice. What stops or fails a trial ends that trial alone.
 """
 
@@ -134,7 +134,7 @@ def ray_trials(
                     yield _outcome(reference, running.pop(reference), place)
                 if told.is_set():
                     raise TrainingStopped(
-                        "told to stop, with a checkpoint of each trial. Run the same command again to go on"
+                        "told to stop, with a checkpoint of each trial. Run the same command again to resume"
                     )
                 if not done:
                     yield None

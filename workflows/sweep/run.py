@@ -36,7 +36,7 @@ Finish = Callable[[list[Outcome], Callable[[], None]], Made]
 
 @dataclass(frozen=True)
 class Settings:
-    """How trials are run and reported; nothing of it changes what is learned."""
+    """How trials are run and reported; nothing of it changes what is trained."""
 
     name: str
     levels: tuple[tuple[float, bool], ...] = ((2.0, True),)
@@ -114,7 +114,7 @@ def _follow(sweep: Sweep, place: Place, running: Trials, told: Callable[[], None
         for outcome in running:
             if outcome is not None:
                 outcomes.append(outcome)
-                progress.tell(outcome)
+                progress.report(outcome)
                 told()
             progress.look()
     return outcomes
@@ -194,7 +194,7 @@ def judge(outcomes: Sequence[Outcome], *, of: int, strict: bool) -> None:
     stopped = [outcome for outcome in outcomes if outcome.state == "stopped"]
     if stopped:
         error = TrainingStopped(
-            f"{_names(stopped)} not finished: {stopped[0].reason}. Run the same command again to go on"
+            f"{_names(stopped)} not finished: {stopped[0].reason}. Run the same command again to resume"
         )
         error.exit_status = stopped[0].exit_status
         raise error

@@ -155,16 +155,6 @@ def test_a_checkpoint_is_chosen(trained: tuple[Path, Path], tmp_path: Path) -> N
     assert command("transfer", "--model", trained[1], "--checkpoint", "newest", *meshes).returncode == 2
 
 
-def test_bad_recipes_and_usage_exit_2(tmp_path: Path) -> None:
-    out = tmp_path / "x.zarr"
-    fails(command("generate", "--recipe", "quickstrat", "--out", out), 2, "did you mean 'quickstart'")
-    fails(
-        command("--recipe", "smoke", "--out", tmp_path / "w", "--set", "training.stepz=3", script="full.py"), 2,
-        "unknown key 'training.stepz', did you mean 'training.steps'?",
-    )  # fmt: skip
-    assert command("generate").returncode == 2 and not out.exists() and not (tmp_path / "w").exists()
-
-
 def test_a_full_disk_is_one_error_and_going_on_ends_with_the_same_bytes(tmp_path: Path) -> None:
     arguments = ("generate", "--recipe", "smoke", "--local", "--set", "data.poses.seen=100")
     undisturbed = tmp_path / "undisturbed.zarr"
@@ -180,29 +170,11 @@ def test_a_full_disk_is_one_error_and_going_on_ends_with_the_same_bytes(tmp_path
         assert tree_hash(data) == tree_hash(undisturbed)
 
 
-def test_missing_and_unfinished_datasets(tmp_path: Path, trained: tuple[Path, Path]) -> None:
-    fails(command("inspect", tmp_path / "no.zarr"), 1, "no dataset at", "dsffnet generate")
-    fails(command("train", "--data", tmp_path / "no.zarr", "--out", tmp_path / "run"), 1, "no dataset at")
-    fails(command("sync", tmp_path), 1, "holds no record of a run")
-
-
-def test_a_relative_out_is_refused_on_a_cluster(tmp_path: Path) -> None:
-    result = command("--recipe", "smoke", "--out", "runs/x", script="full.py", RAY_ADDRESS="127.0.0.1:1")
-    fails(result, 2, "--out 'runs/x' is a relative path", "throw-away copy", "--out /data/runs/x")
-    fails(command("--recipe", "smoke", script="full.py", RAY_ADDRESS="127.0.0.1:1"), 2, "relative path")
-
-
 def test_two_workflows_in_one_folder(tmp_path: Path) -> None:
     with SingleRunFolder(tmp_path / "w").alone():
         fails(
             command("--recipe", "smoke", "--out", tmp_path / "w", script="full.py"), 1, "another command is at work in"
         )
-
-
-def test_fresh_leaves_other_peoples_files_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.txt").write_text("precious")
-    fails(command("--recipe", "smoke", "--out", tmp_path, "--fresh", script="full.py"), 2, "leaves it alone")
-    assert (tmp_path / "thesis.txt").exists()
 
 
 def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: tuple[Path, Path]) -> None:
@@ -218,25 +190,66 @@ def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: 
     assert (tmp_path / "workflow" / "dataset.txt").exists() and (tmp_path / "other" / "thesis.txt").exists()
 
 
-def test_more_bad_input_is_one_line(tmp_path: Path, trained: tuple[Path, Path]) -> None:
-    data, _ = trained
-    (tmp_path / "file").write_text("in the way")
-    (tmp_path / "empty.yaml").write_text("")
-    fails(command("--recipe", "smoke", "--out", tmp_path / "file", script="full.py"), 1, "file")
-    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file" / "x.zarr"), 1, "file")
-    fails(command("generate", "--recipe", "smoke", "--local", "--out", tmp_path / "file", "--fresh"), 1, "is a file")
-    fails(command("recipe", "--recipe", tmp_path / "empty.yaml"), 2, "or is empty")
-    fails(command("recipe", "--set", "training.network.encoder_widths=[0,8,8]"), 2, "encoder_widths.0", "given: 0")
-    fails(command("recipe", "--set", "training.learning_rate=.inf"), 2, "training.learning_rate")
-    fails(command("recipe", "--set", "training.steps=${nothing}"), 2, "interpolation is not supported")
-    fails(command("train", "--data", data, "--out", "s3://bucket/run"), 2, "is a URL")
-    fails(command("evaluate", tmp_path / "norun", "--data", data), 1, "norun has no usable checkpoint")
-    assert not (tmp_path / "norun").exists()
-    silent = command("generate", "--recipe", "smoke", "--out", tmp_path / "y.zarr", RAY_ADDRESS="127.0.0.1:1")
-    fails(silent, 1, "no Ray head answers at RAY_ADDRESS 127.0.0.1:1")
-
-
 def test_printed_recipe_can_be_used_as_a_file(tmp_path: Path) -> None:
     printed = command("recipe", "--recipe", "smoke", "--set", "training.seed=4").stdout
     (tmp_path / "mine.yaml").write_text(printed)
     assert command("recipe", "--recipe", tmp_path / "mine.yaml").stdout == printed
+
+
+ON_CLUSTER = {"RAY_ADDRESS": "127.0.0.1:1"}
+REFUSED: list[tuple[int, str, str, dict[str, str]]] = [
+    (2, "did you mean 'quickstart'", "generate --recipe quickstrat --out new", {}),
+    (2, "unknown key 'training.stepz', did you mean 'training.steps'?", "full --out new --set training.stepz=3", {}),
+    (2, "or is empty", "recipe --recipe empty.yaml", {}),
+    (2, "encoder_widths.0", "recipe --set training.network.encoder_widths=[0,8,8]", {}),
+    (2, "training.learning_rate", "recipe --set training.learning_rate=.inf", {}),
+    (2, "interpolation is not supported", "recipe --set training.steps=${nothing}", {}),
+    (2, "is a URL", "train --data leg.zarr --out s3://bucket/run", {}),
+    (2, "--out 'runs/x' is a relative path", "full --recipe smoke --out runs/x", ON_CLUSTER),
+    (2, "throw-away copy", "full --recipe smoke --out runs/x", ON_CLUSTER),
+    (2, "--out /data/runs/smoke", "full --recipe smoke", ON_CLUSTER),
+    (1, "no Ray head answers at RAY_ADDRESS 127.0.0.1:1", "generate --recipe smoke --out {here}/new", ON_CLUSTER),
+    (2, "leaves it alone", "full --recipe smoke --out . --fresh", {}),
+    (1, "file", "full --recipe smoke --out file", {}),
+    (1, "file", "generate --recipe smoke --local --out file/x.zarr", {}),
+    (1, "is a file", "generate --recipe smoke --local --out file --fresh", {}),
+    (1, "no dataset at", "inspect no.zarr", {}),
+    (1, "dsffnet generate", "inspect no.zarr", {}),
+    (1, "no dataset at", "train --data no.zarr --out new", {}),
+    (1, "holds no record of a run", "sync .", {}),
+    (1, "norun has no usable checkpoint", "evaluate norun --data leg.zarr", {}),
+    (2, "nothing to append", "append leg.zarr", {}),
+    (1, "has 3 training, more than 1", "append leg.zarr --training 1 --local", {}),
+    (1, "no dataset at", "append no.zarr --training 1 --local", {}),
+    (1, "no folder of meshes", "import faust none --out new --local", {}),
+    (2, "unknown key 'upp'", "import npt . --out new --local --set data.body.upp=z", {}),
+    (2, "a whole section", "import npt . --out new --local --set data=5", {}),
+    (2, "a whole section", "import npt . --out new --local --set data.body=5", {}),
+    (2, "is said by the command itself", "import npt . --out new --local --set data.body.path=x", {}),
+    (2, "is said by the command itself", "import npt . --out new --local --set data.body.layout=faust", {}),
+    (1, "https://smpl.is.tue.mpg.de", "generate --recipe smpl-paper --out new --local", {}),
+    (1, "anny-paper", "generate --recipe smpl-paper --out new --local", {}),
+    (1, "stand-in", "generate --recipe smpl-paper --out new --local", {}),
+]
+"""Status, what the one line on standard error holds, the command, and its variables."""
+
+
+@pytest.mark.parametrize(("status", "says", "words", "environment"), REFUSED, ids=[case[2] for case in REFUSED])
+def test_what_cannot_be_done_is_one_line_and_changes_nothing(
+    spoilable: Path, status: int, says: str, words: str, environment: dict[str, str]
+) -> None:
+    here = spoilable.parent
+    (here / "file").write_text("in the way")
+    (here / "empty.yaml").write_text("")
+    before = tree_hash(here)
+    name, *rest = words.format(here=here, nothing="{nothing}").split()
+    given = rest if name == "full" else [name, *rest]
+    done = command(*given, script="full.py" if name == "full" else "dsffnet", folder=here, **environment)
+    fails(done, status, says)
+    for lock in here.rglob("*.lock"):
+        lock.unlink()
+    assert tree_hash(here) == before
+
+
+def test_a_command_without_what_it_needs_is_a_usage_error() -> None:
+    assert command("generate").returncode == 2

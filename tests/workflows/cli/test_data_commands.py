@@ -38,13 +38,6 @@ def test_append_then_make_it_again_from_its_own_attributes(tmp_path: Path) -> No
     assert again.returncode == 0 and tree_hash(data) == tree_hash(tmp_path / "again.zarr")
 
 
-def test_append_without_or_with_wrong_totals(tmp_path: Path) -> None:
-    data = made(tmp_path / "leg.zarr")
-    fails(command("append", data), 2, "nothing to append")
-    fails(command("append", data, "--training", "1", "--local"), 1, "has 4 training, more than 1")
-    fails(command("append", tmp_path / "none.zarr", "--training", "1", "--local"), 1, "no dataset at")
-
-
 def test_inspect_draws_beside_the_person_unless_told_otherwise(tmp_path: Path) -> None:
     data = made(tmp_path / "leg.zarr")
     shown = command("inspect", data, folder=tmp_path)
@@ -69,17 +62,6 @@ def test_export_then_import(tmp_path: Path) -> None:
     assert np.array_equal(first.vertices(5), second.vertices(1)) and np.array_equal(first.faces(5), second.faces(1))
 
 
-def test_import_of_what_is_not_there(tmp_path: Path) -> None:
-    fails(
-        command("import", "faust", tmp_path / "none", "--out", tmp_path / "x.zarr", "--local"), 1, "no folder of meshes"
-    )
-    fails(
-        command("import", "npt", tmp_path, "--out", tmp_path / "x.zarr", "--local", "--set", "data.body.upp=z"),
-        2,
-        "unknown key 'upp'",
-    )
-
-
 def test_a_stand_in_is_made_and_used(tmp_path: Path) -> None:
     file = tmp_path / "smpl.npz"
     written = command("stand-in", "smpl", "--out", file, "--topology", "notoes_collapse3pc")
@@ -90,12 +72,6 @@ def test_a_stand_in_is_made_and_used(tmp_path: Path) -> None:
         "--out", tmp_path / "x.zarr", "--local",
     )  # fmt: skip
     assert used.returncode == 0 and "SMPL neutral sha256:" in used.stdout
-
-
-def test_without_a_model_file_the_message_says_where_to_get_one(tmp_path: Path) -> None:
-    missing = command("generate", "--recipe", "smpl-paper", "--out", tmp_path / "x.zarr", "--local")
-    fails(missing, 1, "https://smpl.is.tue.mpg.de", "anny-paper", "stand-in")
-    assert not (tmp_path / "x.zarr").exists()
 
 
 def test_a_hostile_pickle_is_refused_by_name(tmp_path: Path) -> None:
@@ -120,16 +96,6 @@ def test_a_moved_model_file_is_named_when_going_on(tmp_path: Path) -> None:
     assert command("verify", data, "--repair", "--set", f"{path}/b.npz").returncode == 0
     assert command("append", data, "--unseen", "3", "--local").returncode == 0, "the new path was kept"
     fails(command("append", data, "--unseen", "4", "--set", "data.poses.seed=4"), 2, "can only change where")
-
-
-def test_import_refuses_what_the_command_says_itself(tmp_path: Path) -> None:
-    for given, says in (
-        ("data=5", "a whole section"),
-        ("data.body=5", "a whole section"),
-        ("data.body.path=x", "is said by the command itself"),
-        ("data.body.layout=faust", "is said by the command itself"),
-    ):
-        fails(command("import", "npt", tmp_path, "--out", tmp_path / "x.zarr", "--local", "--set", given), 2, says)
 
 
 def test_s3_without_credentials_is_one_error(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_a_command_that_waits_for_ray_is_stopped_with_its_own_status(told: signa
     process.send_signal(told)
     _, said = process.communicate(timeout=60)
     assert process.returncode == status, said
-    assert said.splitlines()[-1].endswith("run the same command again to go on from here")
+    assert said.splitlines()[-1].endswith("run the same command again to resume")
 
 
 STARTING = """
@@ -67,7 +67,7 @@ def test_a_command_that_is_told_to_stop_while_ray_starts_says_so() -> None:
         [sys.executable, "-c", STARTING], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
     )
     assert ended.returncode == 143, ended.stderr
-    assert ended.stderr.splitlines()[-1] == "stopped; run the same command again to go on from here"
+    assert ended.stderr.splitlines()[-1] == "stopped; run the same command again to resume"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_closed_terminal_ends_a_command_as_the_other_signals_do(
         for number, handler in before.items():
             signal.signal(number, handler)
     assert ended.value.code == status
-    assert capsys.readouterr().err == f"{words}; run the same command again to go on from here\n"
+    assert capsys.readouterr().err == f"{words}; run the same command again to resume\n"
 
 
 def test_nohup_is_heeded() -> None:
