@@ -66,7 +66,7 @@ class Checkpoint:
 
     ``dataset`` is the dataset's uuid, ``dataset_sha256`` the sha256 of its manifest ("" where it was not noted).
     ``finished``: training had come to its end there, by its steps or by early stopping. ``last_step``: the last that
-    its recipe asked for, where noted.
+    its recipe asked for, where noted. ``has_average``: it holds a moving average of the weights.
     """
 
     path: Path
@@ -78,13 +78,13 @@ class Checkpoint:
     best: bool = False
     finished: bool = False
     last_step: int | None = None
+    has_average: bool = False
 
     def weights(self, *, average: bool = False) -> dict[str, Tensor]:
         """Weights by parameter name, on the CPU; ``average``: their moving average, if this training keeps one."""
         if self.path.is_file():
             return read_weights(self.path)
-        has_average = average and (self.path / AVERAGE).exists()
-        return read_weights(resolve_within(self.path, AVERAGE if has_average else WEIGHTS))
+        return read_weights(resolve_within(self.path, AVERAGE if average and self.has_average else WEIGHTS))
 
     def state(self) -> dict[str, Any]:
         """State of the optimiser, the schedule and whatever else training goes on from.
@@ -145,11 +145,12 @@ def save_checkpoint(
     return final
 
 
-def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
-    """A checkpoint of a run, see :data:`Which`; None where there is none.
+def load_checkpoint(run: Path, which: Which = "latest", *, weights_only: bool = False) -> Checkpoint | None:
+    """Return a checkpoint of a run, see :data:`Which`; None where there is none.
 
     A damaged newest one is passed over with a warning that names it, and the one before it is taken. Where ``run`` is
     itself a checkpoint (a step's folder, exported weights, a .safetensors file), that one and no other is meant.
+    ``weights_only``: for inference, which verifies the file that it loads and no other.
 
     Raises
     ------
@@ -157,15 +158,17 @@ def load_checkpoint(run: Path, which: Which = "latest") -> Checkpoint | None:
         The one that was asked for, by its path, its step or as the best, is damaged; or there is no such step.
     """
     if _is_checkpoint(run):
-        return _named(run)
+        return _named(run, weights_only=weights_only)
     if which in ("latest", "result"):
-        found = _newest_sound(run)
-        return load_checkpoint(run, "best") or found if which == "result" and _was_cut_short(found) else found
+        newest = _newest_sound(run, weights_only=weights_only)
+        if which == "latest" or not _was_cut_short(newest):
+            return newest
+        return load_checkpoint(run, "best", weights_only=weights_only) or newest
     path = best_of(run) if which == "best" else step_folder(run, f"step-{which:08d}")
-    return _named(path) if path else None
+    return _named(path, weights_only=weights_only) if path else None
 
 
-def require_checkpoint(run: Path, which: Which = "latest") -> Checkpoint:
+def require_checkpoint(run: Path, which: Which = "latest", *, weights_only: bool = False) -> Checkpoint:
     """As :func:`load_checkpoint`, for a run, a workflow's folder around it, or a checkpoint named by its path.
 
     Raises
@@ -174,12 +177,13 @@ def require_checkpoint(run: Path, which: Which = "latest") -> Checkpoint:
         There is none, or the one that was asked for is damaged.
     """
     inner = run / "run"  # a workflow's folder holds its run under this name
-    found = load_checkpoint(inner if (inner / "checkpoints").exists() else run, which)
-    if found is None and which == "best":
+    folder = inner if (inner / "checkpoints").exists() else run
+    checkpoint = load_checkpoint(folder, which, weights_only=weights_only)
+    if checkpoint is None and which == "best":
         raise CheckpointError(f"{run} has no best checkpoint: none was measured on unseen poses. Take the newest one")
-    if found is None:
+    if checkpoint is None:
         raise CheckpointError(f"{run} has no usable checkpoint. Name the folder of a training that has written one")
-    return found
+    return checkpoint
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -229,9 +233,9 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__}
 
 
-def _newest_sound(run: Path) -> Checkpoint | None:
+def _newest_sound(run: Path, *, weights_only: bool) -> Checkpoint | None:
     for path in newest_first(run):
-        fault = fault_of(path)
+        fault = fault_of(path, weights_only=weights_only)
         if fault is None:
             return read_checkpoint(path)
         log.warning("checkpoint %s is damaged (%s); falling back to the one before it", path, fault)
@@ -243,13 +247,13 @@ def _is_checkpoint(path: Path) -> bool:
     return is_step or path.suffix == ".safetensors" or any((path / name).exists() for name in (WEIGHTS, MANIFEST))
 
 
-def _named(path: Path) -> Checkpoint:
-    """The checkpoint that a person asked for by name: damage in it is an error."""
+def _named(path: Path, *, weights_only: bool) -> Checkpoint:
+    """The checkpoint that a person asked for by name: damage to it is an error."""
     is_file = path.suffix == ".safetensors"
     if is_file and not is_listed(path):
         return _checkpoint(path, read_header(path))
     folder = path.parent if is_file else path
-    fault = fault_of(folder, only=path.name if is_file else None)
+    fault = fault_of(folder, only=path.name if is_file else None, weights_only=weights_only)
     if fault is not None:
         raise CheckpointError(f"checkpoint {path} is damaged or missing ({fault}). Name another, or the run's folder")
     return _checkpoint(path, manifest_of(folder))
@@ -266,4 +270,5 @@ def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
         best=about.get("best", False),
         finished=about.get("finished", False),
         last_step=about.get("last_step"),
+        has_average=AVERAGE in about.get("sha256", {}),
     )

@@ -12,6 +12,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -120,17 +121,27 @@ def write_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     write_atomically(path / MANIFEST, json.dumps(sealed, indent=1).encode())
 
 
-def fault_of(path: Path, *, only: str | None = None, once: bool = False) -> str | None:
-    """What is wrong with the checkpoint in a folder (or with ``only`` one file of it), None if nothing is.
+def fault_of(path: Path, *, only: str | None = None, weights_only: bool = False) -> str | None:
+    """Return what is wrong with the checkpoint in a folder, None if nothing is.
 
-    ``once``: a file that looks as it did when this process last hashed it is not read again.
+    A file is read once in a process, while it stays as it is.
+
+    Parameters
+    ----------
+    only
+        Name of the one file to verify.
+    weights_only
+        Verify the file that inference loads and no other: the average of the weights, where there is one.
     """
     try:
         manifest = manifest_of(path)
         if manifest.get("manifest_sha256", _seal(manifest)) != _seal(manifest):
             return f"{MANIFEST} is not as it was written"
-        for name, digest in manifest["sha256"].items():
-            if only in (None, name) and (_sha256_once if once else sha256_of)(resolve_within(path, name)) != digest:
+        listed = manifest["sha256"]
+        if weights_only and only is None:
+            only = AVERAGE if AVERAGE in listed else WEIGHTS
+        for name in listed if only is None else [only]:
+            if _sha256_once(resolve_within(path, name)) != listed.get(name):
                 return f"sha256 of {name} differs from its manifest"
     except _UNREADABLE as error:
         return str(error)
@@ -178,7 +189,7 @@ def newest_first(run: Path) -> Iterator[Path]:
 
 def forget_old(run: Path, keep: int) -> None:
     """Remove all checkpoints but the newest ``keep`` sound ones and the best, and what a kill left half written."""
-    sound = [path for path in newest_first(run) if fault_of(path, once=True) is None]
+    sound = [path for path in newest_first(run) if fault_of(path) is None]
     for path in set(newest_first(run)) - {*sound[:keep], best_of(run)}:
         shutil.rmtree(path, ignore_errors=True)
     for path in checkpoints_of(run).glob(".partial-*"):
@@ -230,11 +241,17 @@ def _is_marked_best(path: Path) -> bool:
 
 
 def _sha256_once(path: Path) -> str:
-    """As sha256_of, without reading again a file that looks as it did: forgetting would hash every checkpoint kept."""
+    """Return the sha256 of a file, read again only where its status has changed or is so young that it may not tell."""
     status = path.stat()
+    if time.time() - status.st_mtime < _CLOCK_TICK:
+        return sha256_of(path)
     return _known_sha256(path, status.st_ino, status.st_mtime_ns, status.st_size)
 
 
+_CLOCK_TICK = 2.0
+"""Seconds within which two writes of a file may bear the same time, on the coarsest file systems."""
+
+
 @functools.lru_cache(maxsize=64)
-def _known_sha256(path: Path, *looks: int) -> str:
+def _known_sha256(path: Path, *signature: int) -> str:
     return sha256_of(path)

@@ -82,8 +82,10 @@ def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | 
     given = recipe.start_from
     if given is None:
         return None
-    path = Path(decided_by_first(ranks, lambda: str(require_checkpoint(Path(given), "result").path)))
-    return agreed(ranks, lambda: require_checkpoint(path), what="read the weights of training.start_from")
+    path = Path(decided_by_first(ranks, lambda: str(require_checkpoint(Path(given), "result", weights_only=True).path)))
+    return agreed(
+        ranks, lambda: require_checkpoint(path, weights_only=True), what="read the weights of training.start_from"
+    )
 
 
 def require_same_training(recipe: TrainingRecipe, dataset: Dataset, run: Path, checkpoint: Checkpoint) -> None:

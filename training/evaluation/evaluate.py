@@ -175,7 +175,7 @@ def _contenders(methods: Sequence[Method], dataset: Dataset, recipe: EvaluationR
 
 
 def _resolved(method: Method, dataset: Dataset, recipe: EvaluationRecipe) -> Contender:
-    checkpoint = require_checkpoint(Path(method.weights), "result")
+    checkpoint = require_checkpoint(Path(method.weights), "result", weights_only=True)
     network = recipe_of(checkpoint, network_only=True).network
     for pose_type in POSE_TYPES:
         for number, triple in enumerate(evaluation_list(dataset, recipe, pose_type)):

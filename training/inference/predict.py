@@ -29,7 +29,7 @@ def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, Trainin
     CheckpointError
         The run has no usable checkpoint, or its network is none of this version.
     """
-    checkpoint = require_checkpoint(run, which)
+    checkpoint = require_checkpoint(run, which, weights_only=True)
     recipe = recipe_of(checkpoint, network_only=True)
     network = network_from(recipe.network)
     load_weights(network, checkpoint)

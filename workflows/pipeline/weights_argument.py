@@ -47,7 +47,7 @@ def evaluated(place: Path, which: Which = "result") -> Evaluated:
     CheckpointError
         There are none, or they are damaged.
     """
-    checkpoint, step = require_checkpoint(place, which), _step_folder(place)
+    checkpoint, step = require_checkpoint(place, which, weights_only=True), _step_folder(place)
     if step is not None:
         return Evaluated(checkpoint, step.parent.parent, f"step-{checkpoint.step}")
     if checkpoint.path == place:  # exported weights

@@ -1,5 +1,6 @@
 """Checkpoints named after the accidents."""
 
+import hashlib
 import logging
 import os
 import shutil
@@ -97,6 +98,37 @@ def test_a_damaged_newest_falls_back_and_says_so(tmp_path: Path, caplog, spoil, 
         found = load_checkpoint(tmp_path)
     assert found is not None and found.step == 1
     assert "step-00000002" in caplog.text and "damaged" in caplog.text
+
+
+@pytest.mark.parametrize("average", [None, {"layer.weight": torch.zeros(2, 3)}], ids=["weights", "average"])
+def test_inference_verifies_the_file_that_it_loads_and_no_other(tmp_path: Path, average: Any) -> None:
+    folder = save(tmp_path, 1, average=average)
+    for name in ("state.pt", "weights.safetensors")[: 1 if average is None else 2]:
+        flip_bit(folder / name)
+    for place, which in ((tmp_path, "latest"), (tmp_path, 1), (folder, "latest")):
+        found = load_checkpoint(place, which, weights_only=True)
+        assert found is not None and found.weights(average=True)["layer.weight"][0, 0] == (average is None)
+    flip_bit(folder / ("weights.safetensors" if average is None else "average.safetensors"))
+    assert load_checkpoint(tmp_path, weights_only=True) is None
+
+
+def test_a_file_is_hashed_once_in_a_process_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, read = tmp_path / "run", []
+    folder, real = save(run, 1), hashlib.file_digest
+    for path in folder.iterdir():
+        os.utime(path, (1, 1))
+
+    def digest(file: Any, kind: str) -> Any:
+        read.append(Path(os.readlink(f"/proc/self/fd/{file.fileno()}")).name)
+        return real(file, kind)
+
+    monkeypatch.setattr(hashlib, "file_digest", digest)
+    for _ in range(3):
+        require_checkpoint(require_checkpoint(run, weights_only=True).path, weights_only=True)
+    assert read == ["weights.safetensors"]
+    assert require_checkpoint(run).step == 1 and read == ["weights.safetensors", "state.pt"]
+    flip_bit(folder / "weights.safetensors")
+    assert load_checkpoint(run, weights_only=True) is None
 
 
 @pytest.mark.parametrize("at", [0.1, 0.3, 0.7])
