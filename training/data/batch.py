@@ -14,36 +14,10 @@ from datagen.store import Dataset
 from training.data.triples import Triples
 from training.data.vertex_layout import normalised
 from training.objectives.edge_incidence import INCIDENCES, incidence_of, join_incidences
-from training.objectives.losses import loss_edges
+from training.objectives.losses import PackedEdges, loss_edges
 
 Counts = tuple[int, ...]
 EdgeSum = Literal["edges", "faces"]
-
-
-@dataclass(frozen=True)
-class PackedEdges:
-    """Edges of the targets of a batch whose meshes have different topologies.
-
-    Attributes
-    ----------
-    pairs
-        ``[e, 2]`` int64, rows of the padded vertices as one array ``[b * n_target, 3]``: mesh * n_target + vertex.
-    meshes
-        ``[e]`` int64, the mesh of the batch that each edge is of; ascending.
-    """
-
-    pairs: Tensor
-    meshes: Tensor
-
-    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "PackedEdges":
-        """The same on another device."""
-        pairs, meshes = (its.to(device, non_blocking=non_blocking) for its in (self.pairs, self.meshes))
-        return PackedEdges(pairs, meshes)
-
-    def part(self, start: int, stop: int, *, rows: int) -> "PackedEdges":
-        """Those of the meshes from ``start`` to ``stop`` of a batch padded to ``rows`` vertices."""
-        inside = (self.meshes >= start) & (self.meshes < stop)
-        return PackedEdges(self.pairs[inside] - start * rows, self.meshes[inside] - start)
 
 
 @dataclass(frozen=True)
@@ -71,7 +45,7 @@ class Batch:
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
         """The same on another device."""
         meshes = (self.source, self.target, self.truth)
-        source, target, truth = (its.to(device, non_blocking=non_blocking) for its in meshes)
+        source, target, truth = (mesh.to(device, non_blocking=non_blocking) for mesh in meshes)
         edges = self.edges.to(device, non_blocking=non_blocking)
         return Batch(source, target, truth, edges, self.source_counts, self.target_counts)
 
@@ -89,7 +63,7 @@ class Batch:
         if isinstance(edges, PackedEdges):
             edges = edges.part(start, stop, rows=self.target.shape[1])
         at = slice(start, stop)
-        source_counts, target_counts = (its and its[at] for its in (self.source_counts, self.target_counts))
+        source_counts, target_counts = (counts and counts[at] for counts in (self.source_counts, self.target_counts))
         return Batch(self.source[at], self.target[at], self.truth[at], edges, source_counts, target_counts)
 
 
@@ -130,9 +104,9 @@ def _packed(edges: Sequence[Tensor], counts: Sequence[int], rows: int) -> Packed
 
     How they touch is put together from what is known of each topology: sorting a batch's edges anew would take longer.
     """
-    pairs = torch.cat([its + rows * mesh for mesh, its in enumerate(edges)])
-    meshes = torch.cat([torch.full_like(its[:, 0], mesh) for mesh, its in enumerate(edges)])
-    parts = [incidence_of(its, count) for its, count in zip(edges, counts, strict=True)]
+    pairs = torch.cat([own + rows * mesh for mesh, own in enumerate(edges)])
+    meshes = torch.cat([torch.full_like(own[:, 0], mesh) for mesh, own in enumerate(edges)])
+    parts = [incidence_of(own, count) for own, count in zip(edges, counts, strict=True)]
     INCIDENCES[pairs] = join_incidences(pairs, parts, rows)
     return PackedEdges(pairs, meshes)
 

@@ -8,7 +8,8 @@ A batch is the same to the bit from either place. ``device``: the memory of the 
 gather and nothing else. ``stream``: as many as memory has room for (:mod:`training.data.streaming_cache`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from typing import Protocol
 
@@ -22,7 +23,7 @@ from datagen.common.resources import bytes_text
 from datagen.store import Dataset
 from training.data.batch import Batch, EdgeSum, EdgeTable, counts_of
 from training.data.cache_policy import Cache, Choice, choose, room_of, stream_memory
-from training.data.prefetch import Lookahead, Share
+from training.data.prefetch import Share, prepared_ahead
 from training.data.streaming_cache import StreamedMeshes
 from training.data.triples import Triples
 from training.data.vertex_layout import Layout, decode
@@ -88,7 +89,7 @@ class VertexBank:
     ) -> None:
         self._layout, self._meshes, self._edges, self._device = layout, meshes, edges, device
         self.where, self.place = choice.why, choice.place
-        self._lookaheads: list[Lookahead] = []
+        self._ahead: list[Generator[Share]] = []
         self._ready: dict[bytes, Batch] = {}
 
     def __len__(self) -> int:
@@ -117,23 +118,20 @@ class VertexBank:
         """
         if not isinstance(self._meshes, StreamedMeshes):
             return shares  # a gather takes no longer than handing a batch from one thread to another (some 0.2 ms)
-        lookahead = Lookahead(shares, self._prepare, self._steps_together)
-        self._lookaheads.append(lookahead)
-        return self._handed_out(lookahead)
+        self._ahead.append(self._handed_out(shares))
+        return self._ahead[-1]
 
     def close(self) -> None:
         """End the threads and let go of the meshes."""
-        for lookahead in self._lookaheads:
-            lookahead.close()
+        for shares in self._ahead:
+            shares.close()
         self._meshes.close()
 
-    def _handed_out(self, lookahead: Lookahead) -> Iterator[Share]:
-        try:
-            for share, batches in lookahead:
+    def _handed_out(self, shares: Iterator[Share]) -> Generator[Share]:
+        with closing(prepared_ahead(shares, self._prepare, self._steps_together)) as ahead:
+            for share, batches in ahead:
                 self._ready = {triples.tobytes(): batch for triples, batch in zip(share, batches, strict=True)}
                 yield share
-        finally:
-            lookahead.close()
 
     def _steps_together(self, share: Share) -> int:
         """How many steps' meshes to ask for together: no more than are held at a time."""

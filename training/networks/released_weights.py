@@ -6,7 +6,6 @@ correspond part by part, see the two tables. Instance norms have neither weights
 
 from __future__ import annotations
 
-import pickle
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -152,13 +151,9 @@ def filled(network: Network, state: Mapping[str, Tensor], parts: Mapping[str, st
         Naming what is missing, unknown, or of a wrong shape.
     """
     own = network.state_dict()
-    expected = {released_name(name, parts): _released_shape(value) for name, value in own.items()}
-    faults = [*_name_faults(expected, state), *_shape_faults(expected, state)]
-    if faults:
-        raise CheckpointError(f"these weights do not fit {type(network).__name__}: {'; '.join(faults)}")
-    network.load_state_dict(
-        {name: state[released_name(name, parts)].reshape(value.shape) for name, value in own.items()}
-    )
+    names = {name: released_name(name, parts) for name in own}
+    _require_fit(state, {names[name]: value for name, value in own.items()}, f"fit {type(network).__name__}")
+    network.load_state_dict({name: state[names[name]].reshape(value.shape) for name, value in own.items()})
     return network.eval()
 
 
@@ -203,25 +198,28 @@ def _released_state(network: nn.Module, parts: Mapping[str, str]) -> dict[str, T
     }
 
 
-def _released_shape(value: Tensor) -> list[int]:
+def _released_shape(value: Tensor, name: str = "") -> list[int]:
+    """As a convolution over vertices has it: with the width of its kernel, which is 3 where 3D-CoreNet's begins."""
+    if name == "fc.weight":
+        return [value.shape[0], 3, 3]
     return [*value.shape, 1] if value.ndim == 2 else [*value.shape]
 
 
-def _name_faults(expected: Mapping[str, list[int]], state: Mapping[str, Tensor]) -> list[str]:
+def _require_fit(state: Mapping[str, Tensor], own: Mapping[str, Tensor], what: str) -> None:
+    """Raise CheckpointError unless weights have the names, and the shapes, of ``own`` by released names."""
+    shapes = {name: _released_shape(value, name) for name, value in own.items()}
     kinds = {
-        "missing": [name for name in expected if name not in state],
-        "unknown": [name for name in state if name not in expected],
+        "missing": [name for name in own if name not in state],
+        "unknown": [name for name in state if name not in own],
+        "wrong shape": [
+            f"{name} {list(state[name].shape)} instead of {shape}"
+            for name, shape in shapes.items()
+            if name in state and list(state[name].shape) != shape
+        ],
     }
-    return [f"{kind}: {_listed(names)}" for kind, names in kinds.items() if names]
-
-
-def _shape_faults(expected: Mapping[str, list[int]], state: Mapping[str, Tensor]) -> list[str]:
-    wrong = [
-        f"{name} {list(state[name].shape)} instead of {shape}"
-        for name, shape in expected.items()
-        if name in state and list(state[name].shape) != shape
-    ]
-    return [f"wrong shape: {_listed(wrong)}"] if wrong else []
+    if any(kinds.values()):
+        faults = "; ".join(f"{kind}: {_listed(names)}" for kind, names in kinds.items() if names)
+        raise CheckpointError(f"these weights do not {what}: {faults}")
 
 
 def _listed(names: list[str]) -> str:
@@ -255,18 +253,17 @@ def load_released_corenet3d(generator: Path, correspondence: Path) -> CoreNet3D:
         A file cannot be read as tensors by name, or a tensor is missing, left over or of another shape.
     """
     files = {"generator": generator, "correspondence": correspondence}
-    found = {part: _tensors(path) for part, path in files.items()}
+    states = {part: read_released(path) for part, path in files.items()}
     network = CoreNet3D(
-        feature_widths=_corenet3d_widths(found["correspondence"], "adaptive_feature.layer", correspondence),
-        generator_widths=_corenet3d_widths(found["generator"], "conv", generator),
+        feature_widths=_corenet3d_widths(states["correspondence"], "adaptive_feature.layer", correspondence),
+        generator_widths=_corenet3d_widths(states["generator"], "conv", generator),
     )
     own = network.state_dict()
     for part, path in files.items():
-        _require_same(found[part], {name: own[mine] for mine, name in released_names(part).items()}, path)
-    for part in files:
-        for mine, name in released_names(part).items():
-            # A convolution's weight has one dimension more; the lift's nine inputs lie in the order of the kernel.
-            own[mine] = found[part][name].reshape(own[mine].shape)
+        names = released_names(part)
+        _require_fit(states[part], {name: own[mine] for mine, name in names.items()}, f"fit 3D-CoreNet ({path})")
+        # A convolution's weight has one dimension more; the lift's nine inputs lie in the order of the kernel.
+        own |= {mine: states[part][name].reshape(own[mine].shape) for mine, name in names.items()}
     network.load_state_dict(own)
     return network.eval()
 
@@ -313,17 +310,6 @@ def _layer(mine: str, name: str) -> Iterator[tuple[str, str]]:
     yield f"{mine}.bias", f"{name}.bias"
 
 
-def _tensors(path: Path) -> dict[str, Tensor]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise CheckpointError(f"{path} cannot be read as released weights: {reason}") from error
-    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise CheckpointError(f"{path} must hold tensors by name (a state_dict), it holds {type(content).__name__}")
-    return {str(name).removeprefix("module."): value for name, value in content.items()}
-
-
 def _corenet3d_widths(tensors: dict[str, Tensor], layers: str, path: Path) -> tuple[int, int, int]:
     names = [f"{layers}{number}.weight" for number in (1, 2, 3)]
     missing = [name for name in names if name not in tensors or tensors[name].ndim == 0]
@@ -332,23 +318,3 @@ def _corenet3d_widths(tensors: dict[str, Tensor], layers: str, path: Path) -> tu
         raise CheckpointError(f"{path} lacks {', '.join(missing)} of the released 3D-CoreNet ({hint})")
     first, second, third = (tensors[name].shape[0] for name in names)
     return first, second, third
-
-
-def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], path: Path) -> None:
-    faults = [f"missing: {name}" for name in expected if name not in found]
-    faults += [f"unknown: {name}" for name in found if name not in expected]
-    faults += [
-        f"{name}: shape {list(found[name].shape)}, expected {_corenet3d_shape(name, value)}"
-        for name, value in expected.items()
-        if name in found and list(found[name].shape) != _corenet3d_shape(name, value)
-    ]
-    if faults:
-        shown = "; ".join(faults[:5]) + (f"; and {len(faults) - 5} more" if len(faults) > 5 else "")
-        raise CheckpointError(f"{path} does not hold the released 3D-CoreNet: {shown}")
-
-
-def _corenet3d_shape(name: str, own: Tensor) -> list[int]:
-    """Return the shape as a convolution over vertices has it: with the width of its kernel."""
-    if name == "fc.weight":
-        return [own.shape[0], 3, 3]
-    return [*own.shape, 1] if own.ndim == 2 else list(own.shape)

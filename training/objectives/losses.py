@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -20,50 +20,39 @@ from torch.nn.functional import mse_loss
 
 from training.networks.execution import sent
 from training.objectives.edge_incidence import edge_vectors, incidence_of, sum_at_vertices
+from training.recipes.training import TrainingRecipe
 
-EDGE_WEIGHT = 0.0005
-"""Weight of the edge-length loss (DSFFNet, section 4.1)."""
+PAPER = TrainingRecipe()
+"""Its loss is that of the DSFFNet paper."""
 
 SHORTEST_EDGE = 1e-6
 """Reference edges of at most this length have no meaningful ratio: they count as perfect. A body is about 2 long."""
 
 
-class LossRecipe(Protocol):
-    """What the loss reads of a :class:`training.recipes.training.TrainingRecipe`, where the fields are described."""
-
-    @property
-    def reconstruction_weight(self) -> float: ...
-    @property
-    def edge_weight(self) -> float: ...
-    @property
-    def edge_reference(self) -> Literal["truth", "target"]: ...
-    @property
-    def edge_measure(self) -> Literal["length", "squared_length"]: ...
-    @property
-    def edge_sum(self) -> Literal["edges", "faces"]: ...
-
-
 @dataclass(frozen=True)
-class PaperLoss:
-    """The loss of the DSFFNet paper."""
+class PackedEdges:
+    """Edges of the targets of a batch whose meshes have different topologies.
 
-    reconstruction_weight: float = 1.0
-    edge_weight: float = EDGE_WEIGHT
-    edge_reference: Literal["truth", "target"] = "truth"
-    edge_measure: Literal["length", "squared_length"] = "length"
-    edge_sum: Literal["edges", "faces"] = "edges"
+    Attributes
+    ----------
+    pairs
+        ``[e, 2]`` int64, rows of the padded vertices as one array ``[b * n_target, 3]``: mesh * n_target + vertex.
+    meshes
+        ``[e]`` int64, the mesh of the batch that each edge is of; ascending.
+    """
 
+    pairs: Tensor
+    meshes: Tensor
 
-class PackedEdges(Protocol):
-    """The edges of a padded batch whose meshes differ in topology."""
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> PackedEdges:
+        """The same on another device."""
+        pairs, meshes = (part.to(device, non_blocking=non_blocking) for part in (self.pairs, self.meshes))
+        return PackedEdges(pairs, meshes)
 
-    @property
-    def pairs(self) -> Tensor:
-        """``[e, 2]`` int64, rows of the vertices flattened to ``[batch * vertex, 3]``."""
-
-    @property
-    def meshes(self) -> Tensor:
-        """``[e]`` int64, the mesh that each edge belongs to."""
+    def part(self, start: int, stop: int, *, rows: int) -> PackedEdges:
+        """Those of the meshes from ``start`` to ``stop`` of a batch padded to ``rows`` vertices."""
+        inside = (self.meshes >= start) & (self.meshes < stop)
+        return PackedEdges(self.pairs[inside] - start * rows, self.meshes[inside] - start)
 
 
 def transfer_loss(
@@ -73,7 +62,7 @@ def transfer_loss(
     target: Tensor,
     edges: Tensor | PackedEdges,
     counts: Sequence[int] | None = None,
-    recipe: LossRecipe = PaperLoss(),
+    recipe: TrainingRecipe = PAPER,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the weighted loss and its two parts, unweighted and detached.
 

@@ -274,17 +274,21 @@ def _without(name: str):
         (
             "correspondence",
             _without("layer.3.prelu.weight"),
-            r"Corr\.pth does not .* missing: layer\.3\.prelu\.weight$",
+            r"do not fit 3D-CoreNet \(.*Corr\.pth\): missing: layer\.3\.prelu\.weight$",
         ),
         ("correspondence", lambda content: {**content, "extra": torch.zeros(2)}, r"unknown: extra$"),
         (
             "generator",
             lambda content: {**content, "fc.weight": torch.zeros(24, 3, 1)},
-            r"fc\.weight: shape \[24, 3, 1\], expected \[24, 3, 3\]$",
+            r"wrong shape: fc\.weight \[24, 3, 1\] instead of \[24, 3, 3\]$",
         ),
-        ("generator", lambda content: {"epoch": 3}, r"must hold tensors by name"),
-        ("generator", lambda content: [torch.zeros(2)], r"must hold tensors by name .* holds list"),
-        ("generator", lambda content: {"conv1.weight": os.system}, r"cannot be read as released weights"),
+        ("generator", lambda content: {"epoch": 3}, r"under 'epoch' there is int"),
+        ("generator", lambda content: [torch.zeros(2)], r"no weights by name, but list"),
+        (
+            "generator",
+            lambda content: {"conv1.weight": os.system},
+            r"latest_net_G\.pth cannot be loaded: it holds a Python",
+        ),
     ],
 )
 def test_files_that_are_not_the_released_network_are_refused(tmp_path: Path, part: str, change, message: str) -> None:
@@ -301,7 +305,7 @@ def test_missing_damaged_and_exchanged_files_are_refused(tmp_path: Path) -> None
     with pytest.raises(CheckpointError, match=r"Corr\.pth lacks conv1\.weight.*exchanged|G\.pth lacks .*exchanged"):
         load_released_corenet3d(generator=paths["correspondence"], correspondence=paths["generator"])
     paths["generator"].write_bytes(paths["generator"].read_bytes()[:-2000])
-    with pytest.raises(CheckpointError, match=r"latest_net_G\.pth cannot be read"):
+    with pytest.raises(CheckpointError, match=r"latest_net_G\.pth cannot be loaded"):
         load_released_corenet3d(**paths)
 
 

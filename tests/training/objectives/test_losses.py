@@ -12,7 +12,6 @@ from torch import Tensor
 
 from training.objectives import edge_incidence as incidence
 from training.objectives.losses import (
-    PaperLoss,
     edge_length_loss,
     loss_edges,
     reconstruction_loss,
@@ -227,7 +226,7 @@ def test_total_and_its_parts() -> None:
     assert total.item() == pytest.approx(rebuilt.item(), rel=1e-12)
     assert parts["edge"].item() == pytest.approx(_literal_edge_loss(prediction, truth).item(), rel=1e-12)
     assert total.requires_grad and not any(part.requires_grad for part in parts.values())
-    recipe = PaperLoss(edge_weight=0.0)
+    recipe = TrainingRecipe(edge_weight=0.0)
     without, _ = transfer_loss(prediction, truth=truth, target=truth, edges=EDGES, recipe=recipe)
     assert without.item() == parts["reconstruction"].item()
 
@@ -243,7 +242,13 @@ def test_a_recipe_of_training_is_a_recipe_of_the_loss_and_its_default_is_the_pap
 def test_weights_reference_measure_and_sum_are_the_recipes() -> None:
     prediction, truth = _pair()
     target = truth.flip(0)
-    recipe = PaperLoss(1 / 3, 0.25, edge_reference="target", edge_measure="squared_length", edge_sum="faces")
+    recipe = TrainingRecipe(
+        reconstruction_weight=1 / 3,
+        edge_weight=0.25,
+        edge_reference="target",
+        edge_measure="squared_length",
+        edge_sum="faces",
+    )
     loss, parts = transfer_loss(prediction, truth=truth, target=target, edges=EDGES, recipe=recipe)
     edge = 3 * _literal_edge_loss(prediction, target, power=2).item()
     assert parts["edge"].item() == pytest.approx(edge, rel=1e-12)
