@@ -87,7 +87,7 @@ class Checkpoint:
         return read_weights(resolve_within(self.path, AVERAGE if average and self.has_average else WEIGHTS))
 
     def state(self) -> dict[str, Any]:
-        """State of the optimiser, the schedule and whatever else training goes on from.
+        """State of the optimiser, the schedule and whatever else training resumes from.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Checkpoint:
             These are weights only, or what is beside them is no state of a training.
         """
         if not (self.path / STATE).is_file():
-            raise CheckpointError(f"{self.path} holds weights only, which training can start from but not go on from")
+            raise CheckpointError(f"{self.path} holds weights only, which training can start from but not resume from")
         return read_state(self.path, STATE)
 
 

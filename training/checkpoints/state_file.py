@@ -1,4 +1,4 @@
-"""The file of what a training goes on from (state.pt), read without trusting it."""
+"""The file of what a training resumes from (state.pt), read without trusting it."""
 
 import os
 import zipfile
@@ -45,8 +45,8 @@ def _require_no_larger(file: BufferedReader) -> None:
 
 
 def unusable_state(folder: Path, reason: str) -> CheckpointError:
-    """Return the error of a checkpoint whose state training cannot go on from."""
+    """Return the error of a checkpoint whose state training cannot resume from."""
     return CheckpointError(
-        f"{folder} holds no state that training can go on from ({reason}). "
+        f"{folder} holds no state that training can resume from ({reason}). "
         f"Begin from its weights: --set training.start_from={folder}, in another --out"
     )

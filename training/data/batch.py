@@ -27,7 +27,7 @@ class Batch:
     Attributes
     ----------
     source, target, truth
-        ``[b, n, 3]``; n_source may differ from n_target. Rows behind a mesh's count are zero.
+        ``[b, n, 3]``; n_source may differ from n_target. Rows after a mesh's count are zero.
     edges
         ``[e, 2]`` int64 indices of vertices where all targets have one topology; else `PackedEdges`.
     source_counts, target_counts

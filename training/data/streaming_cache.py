@@ -68,7 +68,7 @@ class StreamedMeshes:
             for mesh in np.setdiff1d(wanted, missing).tolist():
                 self._slot.move_to_end(mesh)
             places = np.flatnonzero(np.diff(self._layout.shards[missing])) + 1
-            by_shard = [its for its in np.split(missing, places) if len(its)]
+            by_shard = [some for some in np.split(missing, places) if len(some)]
             for some, read in zip(by_shard, self._readers.map(self._read, by_shard), strict=True):
                 self._hold(some, read)
 

@@ -104,7 +104,7 @@ class TripleOrder:
         return (stop - start) * ranks / self.batch
 
     def _cuts(self, *, rank: int, ranks: int, parts: int) -> list[tuple[int, int]]:
-        """First and behind-last place of each part; sizes differ by one at most where they do not divide the batch."""
+        """First place of each part, and the place after its last; sizes differ by one at most."""
         if self.batch < ranks * parts:
             raise RecipeError(
                 f"training.batch {self.batch} is too small to be shared by {ranks} ranks in {parts} parts each; "

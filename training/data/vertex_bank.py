@@ -11,7 +11,6 @@ gather and nothing else. ``stream``: as many as memory has room for (:mod:`train
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,16 +32,6 @@ _TOGETHER_BYTES = 2**26
 """Of meshes that are streamed at a time; batches of three times as many may be ready."""
 
 
-class Meshes(Protocol):
-    """Where vertices are."""
-
-    def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
-        """Return the vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to its largest."""
-
-    def close(self) -> None:
-        """Release what is held beside memory."""
-
-
 class HeldMeshes:
     """All vertices [vertex, 3] of a layout in one tensor on a device."""
 
@@ -51,7 +40,10 @@ class HeldMeshes:
         self._device = vertices.device
 
     def gather(self, *groups: NDArray[np.int64]) -> list[Tensor]:
-        """See :class:`Meshes`. The numbers of all groups are sent to the device together."""
+        """Return the vertices [mesh, vertex, 3] of each group of meshes, padded with zeros to its largest.
+
+        The numbers of all groups are sent to the device together.
+        """
         meshes, sizes = np.concatenate(groups), [len(group) for group in groups]
         if self._count is not None:
             whole = self._vertices.view(-1, self._count, 3)
@@ -69,9 +61,6 @@ class HeldMeshes:
         vertices = self._vertices.index_select(0, (starts[:, None] + torch.where(inside, places, 0)).flatten())
         return vertices.view(*inside.shape, 3).masked_fill_(~inside[..., None], 0)
 
-    def close(self) -> None:
-        """See :class:`Meshes`."""
-
 
 class VertexBank:
     """Batches of triples from meshes that are kept somewhere.
@@ -85,7 +74,13 @@ class VertexBank:
     """
 
     def __init__(
-        self, layout: Layout, meshes: Meshes, edges: EdgeTable, choice: Choice, *, device: torch.device
+        self,
+        layout: Layout,
+        meshes: HeldMeshes | StreamedMeshes,
+        edges: EdgeTable,
+        choice: Choice,
+        *,
+        device: torch.device,
     ) -> None:
         self._layout, self._meshes, self._edges, self._device = layout, meshes, edges, device
         self.where, self.place = choice.why, choice.place
@@ -125,7 +120,8 @@ class VertexBank:
         """End the threads and let go of the meshes."""
         for shares in self._ahead:
             shares.close()
-        self._meshes.close()
+        if isinstance(self._meshes, StreamedMeshes):
+            self._meshes.close()
 
     def _handed_out(self, shares: Iterator[Share]) -> Generator[Share]:
         with closing(prepared_ahead(shares, self._prepare, self._steps_together)) as ahead:

@@ -55,7 +55,7 @@ class Layout:
         self._split = np.array([SPLITS.index(grid.split(identity)) for identity in self.identities])
         self._place = np.stack([self._places_in(split) for split in SPLITS])
         within = [self._shards_in(grid.split(identity)) for identity in self.identities]
-        self.shards = self._owner * (1 + max(its[-1] for its in within)) + np.concatenate(within)
+        self.shards = self._owner * (1 + max(shards[-1] for shards in within)) + np.concatenate(within)
 
     def _rows_in(self, split: Split) -> NDArray[np.int64]:
         """The pose of each row of a split's identities, as :meth:`datagen.grid.Grid.rows_of` has it."""

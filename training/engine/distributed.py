@@ -137,7 +137,7 @@ def agreed(ranks: Ranks, do: Callable[[], _Answer], *, what: str) -> _Answer:
     try:
         answer = do()
     except Exception as error:  # whatever it is, the others must not wait in their next exchange
-        failure = _as_told(error)
+        failure = _as_storage_error(error)
     if any_rank([failure is not None], ranks)[0]:
         raise failure or TrainingError(f"another rank could not {what}; see what it says", secondary=True)
     return cast(_Answer, answer)
@@ -152,13 +152,15 @@ def gathered(value: _Answer, ranks: Ranks) -> list[_Answer]:
     return values
 
 
-def _as_told(error: Exception) -> Exception:
-    """An error of the file system as what a person is told; any other as it is."""
+def _as_storage_error(error: Exception) -> Exception:
+    """An error of the file system as one of storage; any other as it is."""
     if not isinstance(error, OSError):
         return error
-    told = StorageError(f"{error.filename or 'a file of the run'}: {error.strerror or error}. Mend it and run again")
-    told.__cause__ = error
-    return told
+    failure = StorageError(
+        f"{error.filename or 'a file of the run'}: {error.strerror or error}. Repair it and run again"
+    )
+    failure.__cause__ = error
+    return failure
 
 
 def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
@@ -169,7 +171,7 @@ def decided_by_first(ranks: Ranks, decide: Callable[[], _Answer]) -> _Answer:
         try:
             answer[0] = decide()
         except Exception as error:  # whatever it is, the others must not wait for an answer
-            failure = _as_told(error)
+            failure = _as_storage_error(error)
             answer[1] = str(failure)
     if ranks.count > 1:
         dist.broadcast_object_list(answer, src=0)

@@ -76,12 +76,12 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     except DsffnetError:
         raise
     except Exception as error:
-        raise _failure_of(run) or TrainingError(
+        raise failure_of(run) or TrainingError(
             f"the training ranks died {_RESTARTS + 1} times without a new checkpoint; the last reason: "
             f"{(str(error).strip().splitlines() or [type(error).__name__])[-1]}. "
             "Run the same command again to resume from the newest checkpoint"
         ) from error
-    failure = _failure_of(run)
+    failure = failure_of(run)
     if failure:
         raise failure
 
@@ -132,7 +132,7 @@ def _say(who: str, where: str) -> None:
 
 
 def _workers(recipe: TrainingRecipe) -> int | tuple[int, int]:
-    """So many, or (elastic) as many as there are nodes for: a lost one is gone on without, a new one is taken in."""
+    """So many, or (elastic) as many as there are nodes for: a lost one is done without, a new one is taken in."""
     return (recipe.fewest_ranks, recipe.ranks) if recipe.fewest_ranks else recipe.ranks
 
 
@@ -157,7 +157,7 @@ def train_rank(config: dict[str, Any]) -> None:
         raise
 
 
-def _failure_of(run: Path) -> TrainingError | None:
+def failure_of(run: Path) -> TrainingError | None:
     """What a rank left for the driver to say, with its exit status; None where it left nothing that can be read."""
     about = read_json_if_whole(run, _FAILURE, _LEFT)
     if about is None:

@@ -1,6 +1,6 @@
 """Optimiser, learning rate over the run, and averaged weights, by the recipe.
 
-All three are the same on every rank without a word between them, and go on after a resume as if nothing had happened:
+All three are the same on every rank without a word between them, and resume as if nothing had happened:
 the learning rate is a function of the step alone, and the average one of the weights that every rank has.
 """
 
@@ -40,7 +40,7 @@ def build_optimiser(network: nn.Module, recipe: TrainingRecipe) -> torch.optim.O
 
 
 def load_optimiser(optimiser: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """Go on from the moments in an optimiser's state; its hyperparameters stay those of the recipe.
+    """Resume from the moments in an optimiser's state; its hyperparameters stay those of the recipe.
 
     So does the fused form, which alone leaves out a step that is not finite.
 
@@ -151,7 +151,7 @@ class Schedule:
         return {"step": self._done}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on from there. The optimiser's own state, if any, must be loaded before.
+        """Resume from there. The optimiser's own state, if any, must be loaded before.
 
         Raises
         ------
@@ -212,7 +212,7 @@ class WeightAverage:
         return {"updates": self._updates, "weights": self.weights}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from there.
+        """Resume from there.
 
         Raises
         ------

@@ -18,6 +18,7 @@ from training.objectives.metrics import point_mesh_distance
 from training.viz.mesh_grid import ROLE_COLORS
 from training.viz.render.renderer import Camera, frame, render_mesh
 from training.viz.style import DPI, INK, PAGE, QUIET, saved
+from training.viz.transfer_example import standing_point
 
 COLUMNS = {"source": "Source", "target": "Target", "output": "Output", "truth": "Ground truth"}
 _PANEL, _MARGIN, _HEAD, _GAP = (230, 260), 16, 84, 10
@@ -108,7 +109,7 @@ def _rows(network: nn.Module, batch: Batch, faces: Integers) -> list[_Row]:
     return [
         _Row(
             meshes={
-                role: arrays[role][number] - _foot(arrays["truth" if role == "output" else role][number])
+                role: arrays[role][number] - standing_point(arrays["truth" if role == "output" else role][number])
                 for role in COLUMNS
             },
             faces=np.asarray(faces, np.int64),
@@ -128,9 +129,3 @@ def _panel(role: str, vertices: Floats, faces: Integers, camera: Camera) -> NDAr
         return np.full((_PANEL[1], _PANEL[0], 3), 255, np.uint8)
     inside = np.clip(vertices, -_FAR, _FAR)
     return render_mesh(inside, faces, colors=ROLE_COLORS[role], camera=camera, size=_PANEL, background=PAGE)
-
-
-def _foot(vertices: Floats) -> Floats:
-    """Return the point [3] under the middle of a mesh, at the height of its lowest vertex."""
-    low, high = vertices.min(0), vertices.max(0)
-    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])

@@ -1,4 +1,4 @@
-"""What a training is: the job that it does, and the state that it goes on from, which a checkpoint holds."""
+"""What a training is: the job that it does, and the state that it resumes from, which a checkpoint holds."""
 
 import logging
 from collections.abc import Mapping
@@ -84,7 +84,7 @@ class Verdict:
 
 @dataclass
 class State:
-    """What a training goes on from, all of it in a checkpoint."""
+    """What a training resumes from, all of it in a checkpoint."""
 
     learner: Learner
     verdict: Verdict

@@ -51,7 +51,7 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
 def predict(network: nn.Module, batch: "Batch") -> Tensor:
     """Output vertices [batch, vertex, 3] in float32 precision, a few meshes at a time so that memory stays bounded.
 
-    Rows behind a mesh's count are zero. On a GPU a single pair whose shapes have come before is replayed (see
+    Rows after a mesh's count are zero. On a GPU a single pair whose shapes have come before is replayed (see
     :class:`GraphedTransfer`).
     """
     parts = [batch.part(start, start + _MESHES_AT_ONCE) for start in range(0, len(batch), _MESHES_AT_ONCE)]

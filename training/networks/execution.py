@@ -184,7 +184,7 @@ class GraphedTransfer:
         return (self._precision, *inputs, places)
 
     def _run(self, source: Tensor, target: Tensor) -> Tensor:
-        # without the cache of rounded weights: a graph would go on reading it after it is gone
+        # without the cache of rounded weights: a graph would still read it after it is gone
         with products(self._precision), autocast(self._precision, source.device, cached=False):
             return cast(Tensor, self._network(source=source, target=target))
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 Counts = Sequence[int]
-"""Vertices of each mesh of a batch; rows behind them are padding and may hold anything."""
+"""Vertices of each mesh of a batch; rows after them are padding and may hold anything."""
 
 
 class MixedCounts(nn.Module):
@@ -45,7 +45,7 @@ class MixedCounts(nn.Module):
         source_counts: Counts | None = None,
         target_counts: Counts | None = None,
     ) -> Tensor:
-        """Return ``[b, n_target, 3]``; rows behind a mesh's count are zero.
+        """Return ``[b, n_target, 3]``; rows after a mesh's count are zero.
 
         Parameters
         ----------

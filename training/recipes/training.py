@@ -126,7 +126,7 @@ class TrainingRecipe(Frozen):
     epochs: int = Field(200, ge=1, description="epochs; one epoch is identities x poses triples")
     steps: int | None = Field(None, ge=1, description="stop after this many steps instead; the schedule spans them")
     budget: Annotated[str, AfterValidator(_is_time)] | None = Field(
-        None, description="time after which one command stops with a checkpoint, e.g. 10min; run it again to go on"
+        None, description="time after which one command stops with a checkpoint, e.g. 10min; run it again to resume"
     )
     optimiser: Literal["adamw", "adam"] = Field("adamw", description="AdamW, or Adam (NPT, 3D-CoreNet)")
     betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = Field(
@@ -152,7 +152,7 @@ class TrainingRecipe(Frozen):
     fewest_ranks: int | None = Field(
         None,
         ge=1,
-        description="launcher ray: go on with so few when nodes are lost (elastic); default: as many as ranks",
+        description="launcher ray: continue with so few when nodes are lost (elastic); default: as many as ranks",
     )
     launcher: Literal["auto", "ray", "inline"] = Field(
         "auto",
@@ -214,7 +214,7 @@ class TrainingRecipe(Frozen):
         return self
 
     def require_same_learning(self, other: "TrainingRecipe", *, where: str) -> None:
-        """Refuse to go on from a run that learned by another recipe.
+        """Raise if a run that is to be resumed was trained by another recipe.
 
         Raises
         ------
@@ -247,7 +247,7 @@ _HOW_IT_RUNS = {
     "log_every", "evaluate_every", "evaluate_triples", "picture_every", "checkpoint_every", "keep_checkpoints",
     "timeout",
 }  # fmt: skip
-"""Fields that do not change what is learned, so that a run may go on with other values of them."""
+"""Fields that do not change what is learned, so that a run may be resumed with other values of them."""
 _WHEN_IT_STOPS = {"evaluate_every", "evaluate_triples"}
 
 

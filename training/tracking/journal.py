@@ -9,12 +9,13 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, Strict, TypeAdapter, ValidationError
 
-from datagen.common.errors import StorageError
+from datagen.common.errors import storage_errors
 from datagen.common.files import open_regular, resolve_within
 from datagen.common.json_files import warn_once
 
@@ -45,11 +46,9 @@ class Journal:
         if step <= self._last:
             return
         line = json.dumps({"step": step, "time": time.time(), **values}).encode() + b"\n"
-        try:
+        with self._writing():
             if self._file.write(line) != len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise self._unwritten(error) from error
         self._last = step
 
     def sync(self) -> None:
@@ -60,13 +59,11 @@ class Journal:
         StorageError
             The disk is full or out of order.
         """
-        try:
+        with self._writing():
             os.fsync(self._file.fileno())
-        except OSError as error:
-            raise self._unwritten(error) from error
 
-    def _unwritten(self, error: OSError) -> StorageError:
-        return StorageError(f"could not write {self._path}: {error.strerror}. Run again once there is room")
+    def _writing(self) -> AbstractContextManager[None]:
+        return storage_errors(self._path, advice="Run again once there is room")
 
     @property
     def next_step(self) -> int:
@@ -89,7 +86,7 @@ def read_journal(path: Path) -> list[dict[str, Any]]:
 
 
 def journal_from(path: Path, offset: int) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Whole lines from byte ``offset`` on, each with the offset just behind it; garbage is left out, with a warning.
+    """Whole lines from byte ``offset`` on, each with the offset just after it; garbage is left out, with a warning.
 
     Raises
     ------
@@ -122,7 +119,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
 
 
 def _drop_torn_line(path: Path) -> None:
-    """Cut off what is behind the last line's end."""
+    """Cut off what is after the last line's end."""
     if not path.exists():
         return
     with open_regular(resolve_within(path.parent, path.name)) as file:

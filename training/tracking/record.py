@@ -95,7 +95,7 @@ def write_record(folder: Path, record: Record) -> None:
 
 
 def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, parameters: dict[str, str]) -> Record:
-    """Begin a record, or go on with the one that is there (its start time and its id stay).
+    """Begin a record, or resume the one that is there (its start time and its id stay).
 
     An unreadable one is set aside. ``parent`` is kept where it holds ``folder``; a record elsewhere stands alone.
     """

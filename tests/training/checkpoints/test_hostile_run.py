@@ -20,7 +20,7 @@ from datagen.common.errors import CheckpointError, DsffnetError, UnsafeFileError
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import load_checkpoint, require_checkpoint, save_checkpoint
 from training.checkpoints.folder import manifest_of, write_manifest
-from training.engine.launch import _failure_of
+from training.engine.launch import failure_of
 from training.engine.trainer import train
 from training.evaluation import generalisation, robustness
 from training.evaluation.results import read_rows
@@ -91,7 +91,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "own recipe": own_recipe,
     "journal": lambda run: read_journal(run / "metrics.jsonl"),
     "append": lambda run: Journal(run / "metrics.jsonl").close(),
-    "failure": _failure_of,
+    "failure": failure_of,
     "rows": lambda run: read_rows(run / "rows.csv"),
     "recipe": lambda run: recipe_in(run / "recipe.yaml"),
     "what was run": what_was_run,

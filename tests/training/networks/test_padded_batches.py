@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from training.networks import build_network
+from tests.support.three_networks import FORMS, PAIRING, lively
 from training.networks.padded_batches import MixedCounts
 
 COUNTS = ([40, 31, 40, 7], [25, 50, 25, 50])
@@ -19,46 +19,21 @@ def padded(counts: list[int], seed: int) -> torch.Tensor:
     return meshes
 
 
-NETWORKS: dict[str, dict[str, object]] = {
-    "dsffnet": {"encoder_widths": (8, 16, 24), "decoder_widths": (16, 32, 16)},
-    "npt": {"encoder_widths": (8, 16, 29)},
-    "corenet3d": {"feature_widths": (8, 8, 16), "generator_widths": (32, 16, 16)},
-}
-
-
-@pytest.fixture(params=sorted(NETWORKS))
-def network(request: pytest.FixtureRequest) -> nn.Module:
-    torch.manual_seed(0)
-    made = build_network(request.param, **NETWORKS[request.param]).eval()
-    with torch.no_grad():
-        for name, parameter in made.named_parameters():
-            if "parametrizations" not in name:  # those are of spectral norms, whose buffers would no longer fit
-                parameter.copy_(torch.randn_like(parameter) * 0.3)
-    return made
-
-
-def test_each_mesh_gets_what_it_gets_alone(network: nn.Module) -> None:
-    source, target = padded(COUNTS[0], 1), padded(COUNTS[1], 2)
-    together = MixedCounts(network)(source=source, target=target, source_counts=COUNTS[0], target_counts=COUNTS[1])
+@pytest.mark.parametrize("form", FORMS)
+def test_each_mesh_gets_what_it_gets_alone(form: str) -> None:
+    network, counts = lively(form).eval(), COUNTS if form != PAIRING else (COUNTS[1], COUNTS[1])
+    source, target = padded(counts[0], 1), padded(counts[1], 2)
+    together = MixedCounts(network)(source=source, target=target, source_counts=counts[0], target_counts=counts[1])
     assert together.shape == target.shape
-    for mesh, (n_source, n_target) in enumerate(zip(*COUNTS, strict=True)):
+    for mesh, (n_source, n_target) in enumerate(zip(*counts, strict=True)):
         alone = network(source=source[mesh : mesh + 1, :n_source], target=target[mesh : mesh + 1, :n_target])
         assert torch.allclose(together[mesh, :n_target], alone[0], atol=1e-5)
         assert not together[mesh, n_target:].any()
 
 
-def test_pairing_vertices_works_in_mixed_batches_too() -> None:
-    torch.manual_seed(0)
-    network = build_network("npt", encoder_widths=(8, 16, 29), variant="origin").eval()
-    source, target = padded(COUNTS[1], 1), padded(COUNTS[1], 2)
-    together = MixedCounts(network)(source=source, target=target, source_counts=COUNTS[1], target_counts=COUNTS[1])
-    for mesh, count in enumerate(COUNTS[1]):
-        alone = network(source=source[mesh : mesh + 1, :count], target=target[mesh : mesh + 1, :count])
-        assert torch.allclose(together[mesh, :count], alone[0], atol=1e-5)
-
-
-def test_gradients_are_the_sum_of_the_single_ones(network: nn.Module) -> None:
-    network = network.double()
+@pytest.mark.parametrize("form", [form for form in FORMS if form != PAIRING])
+def test_gradients_are_the_sum_of_the_single_ones(form: str) -> None:
+    network = lively(form, dtype=torch.float64).eval()
     source, target = padded(COUNTS[0], 1).double(), padded(COUNTS[1], 2).double()
     weights = padded(COUNTS[1], 3).double().nan_to_num()
     mixed = MixedCounts(network)
@@ -86,6 +61,6 @@ def test_equal_counts_are_one_call_of_the_network() -> None:
 
 
 @pytest.mark.parametrize("counts", [[1, 2], [0, 1, 1], [1, 1, 10]])
-def test_counts_that_do_not_fit(network: nn.Module, counts: list[int]) -> None:
+def test_counts_that_do_not_fit(counts: list[int]) -> None:
     with pytest.raises(ValueError, match=r"target_counts must be 3 numbers from 1 to 9, .*\[3, 9, 3\]"):
-        MixedCounts(network)(source=torch.rand(3, 9, 3), target=torch.rand(3, 9, 3), target_counts=counts)
+        MixedCounts(nn.Identity())(source=torch.rand(3, 9, 3), target=torch.rand(3, 9, 3), target_counts=counts)
