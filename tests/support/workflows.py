@@ -6,15 +6,27 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 import yaml
 
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import tiny_training
+from training.checkpoints.checkpoint import save_checkpoint
 from training.engine.trainer import train
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, write_rows
 from training.evaluation.tables import report
+from training.inference.predict import network_from
 from training.reports.examples import draw_training_curve
 from training.tracking.record import begin_record, end_record, update_record
+
+
+def untrained_run(run: Path) -> Path:
+    """A run whose one checkpoint holds a tiny network as training begins with it; as good as any to be read."""
+    recipe = tiny_training()
+    torch.manual_seed(0)
+    about = {"step": 1, "recipe": recipe.model_dump(mode="json"), "dataset": ""}
+    save_checkpoint(run, about=about, weights=network_from(recipe.network).state_dict(), state={}, keep=1)
+    return run
 
 
 def rows_on(dataset: Dataset) -> list[Row]:

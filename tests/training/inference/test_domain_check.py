@@ -9,8 +9,8 @@ import pytest
 from datagen.generate import generate
 from datagen.mesh.geometry import Mesh
 from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.workflows import untrained_run
 from training.checkpoints.checkpoint import require_checkpoint
-from training.engine.trainer import train
 from training.inference.domain_check import Seen, noted, part_sizes, remarks, seen_by
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation
 from workflows.pipeline.train import write_head
@@ -103,9 +103,8 @@ def test_proportions_and_vertex_counts_beyond_training() -> None:
 def test_what_a_run_saw_is_asked_of_its_dataset_while_it_is_there(tmp_path: Path) -> None:
     data = tmp_path / "leg.zarr"
     generate(tiny_dataset(), str(data))
-    train(tiny_training(steps=1), data=str(data), run=tmp_path / "run")
+    weights = require_checkpoint(untrained_run(tmp_path / "run")).path
     (tmp_path / "run" / "provenance.json").write_text(json.dumps({"dataset": {"url": str(data)}}))
-    weights = require_checkpoint(tmp_path / "run").path
     seen = seen_by(weights)
     assert seen is not None and seen.vertices == (32, 32)
     assert (seen.least <= seen.most).all() and seen.most.max() == 1

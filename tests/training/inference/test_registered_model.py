@@ -13,8 +13,8 @@ from datagen.common.errors import MeshError, RecipeError, RegistryError
 from datagen.generate import generate
 from datagen.mesh.files import read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh
-from tests.support.recipes import tiny_dataset, tiny_training
-from training.engine.trainer import train
+from tests.support.recipes import tiny_dataset
+from tests.support.workflows import untrained_run
 from training.inference.orientation import EVERY_AXES, Axes, Orientation
 from training.inference.registered_model import PoseTransferModel, download_weights
 from training.inference.transfer import PoseTransfer
@@ -22,10 +22,10 @@ from training.inference.transfer import PoseTransfer
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny run, and a mesh in the wanted pose and one of the wanted identity."""
+    """A run, and a mesh in the wanted pose and one of the wanted identity."""
     folder = tmp_path_factory.mktemp("registered")
     dataset = generate(tiny_dataset(), str(folder / "leg.zarr"))
-    train(tiny_training(), data=str(folder / "leg.zarr"), run=folder / "run")
+    untrained_run(folder / "run")
     save_mesh(Mesh(dataset.vertices(3, 7), dataset.faces(3)), folder / "pose.obj")
     save_mesh(Mesh(dataset.vertices(4, 0), dataset.faces(4)), folder / "person.obj")
     return folder
