@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from datagen.generate import generate
 from datagen.mesh.files import read_mesh_file, save_mesh, write_posed
@@ -16,71 +17,9 @@ from datagen.poses.pose_files import write_pose_file
 from datagen.poses.skeletons import JOINTS
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.shapes.mesh_files import GOLDEN, golden
 from tests.support.shapes.models import random_model, save_npz, save_pickle
 from tests.support.shapes.rigged_files import Rig, about
-
-OBJ = """# made by hand
-mtllib look.mtl
-o person
-v 0 0 0 0.1 0.2 0.3
-v 1 0 0 0.1 0.2 0.3
-v 1 1 0 0.1 0.2 0.3
-v 0 1 0 0.1 0.2 0.3
-v 0 0 1 0.1 0.2 0.3
-v 1 0 2 0.1 0.2 0.3
-vt 0 0
-vt 1 0.5
-vn 0 0 -1
-g sides
-usemtl skin
-s off
-f 4/1/1 3/2/1 2/1/1 1/2/1
-f 5/1 6/2 2/1
-usemtl cloth
-f -6//1 -5//1 -1//1
-f 1 2 3 \\
-4
-"""
-LOOK = "newmtl skin\nKd 1 0.5 0.25\nmap_Kd -clamp on skin of me.png\nnewmtl cloth\nKd 0 0 1\nd 0.5\n"
-PLY = """ply
-format ascii 1.0
-comment TextureFile skin of me.png
-element vertex 5
-property float x
-property float y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-element face 3
-property list uchar int vertex_indices
-end_header
-0 0 0 255 0 0
-1 0 0 255 0 0
-0 2 0 0 0 7
-0 0 3 1 1 1
-1 1 1 1 1 1
-3 0 1 2
-4 0 3 4 1
-3 1 2 3
-"""
-STL = """solid thing
-facet normal 0 0 1
-outer loop
-vertex 0 0 0
-vertex 1 0 0
-vertex 0 2 0
-endloop
-endfacet
-facet normal 0 1 0
-outer loop
-vertex 0 0 0
-vertex 0 0 3
-vertex 1 0 0
-endloop
-endfacet
-endsolid thing
-"""
 
 
 class Specimens:
@@ -192,18 +131,13 @@ def _make_recipe(folder: Path, specimens: Specimens) -> None:
 
 def _make_mesh(folder: Path, specimens: Specimens) -> None:
     """Each format with all that it can hold, in a folder of its own with the files that belong to it."""
-    home = folder / "obj"
-    home.mkdir()
-    (home / "mesh.obj").write_text(OBJ)
-    (home / "look.mtl").write_text(LOOK)
-    (home / "skin of me.png").write_bytes(b"\x89PNG\r\n\x1a\n and so on")
+    rich = read_mesh_file(golden("cube.obj", folder / "obj").rename(folder / "obj" / "mesh.obj"))
     for suffix in ("ply", "glb", "off", "stl"):
-        (folder / suffix).mkdir()
-        read = read_mesh_file(home / "mesh.obj")
-        write_posed(read, read.mesh.vertices, folder / suffix / f"mesh.{suffix}")
-    for suffix, text in (("ply", PLY), ("stl", STL)):
-        (folder / f"{suffix} text").mkdir()
-        (folder / f"{suffix} text" / f"mesh.{suffix}").write_text(text)
+        write_posed(rich, rich.mesh.vertices, folder / suffix / f"mesh.{suffix}")
+    (folder / "obj" / "mesh.obj").write_bytes((GOLDEN / "cube.obj").read_bytes() + b"f 1 2 3 \\\n4\n")
+    golden("rich.ply", folder / "ply text").rename(folder / "ply text" / "mesh.ply")
+    (folder / "stl text").mkdir()
+    trimesh.creation.box().export(folder / "stl text" / "mesh.stl", file_type="stl_ascii")
 
 
 def _make_plain(folder: Path, specimens: Specimens) -> None:

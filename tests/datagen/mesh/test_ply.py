@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from datagen.mesh.files import read_mesh_file, write_posed
-from tests.support.shapes.mesh_files import GOLDEN, golden
+from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]])
 POLYGONS = [[3, 2, 1, 0], [0, 1, 4], [1, 2, 4]]
@@ -16,12 +16,11 @@ POLYGONS = [[3, 2, 1, 0], [0, 1, 4], [1, 2, 4]]
 @pytest.mark.parametrize("name", ["rich.ply", "rich-little.ply", "rich-big.ply"])
 def test_all_but_positions_and_normals_of_a_ply_file_stays(tmp_path: Path, name: str) -> None:
     content = golden(name, tmp_path).read_bytes()
-    (tmp_path / "skin.png").write_bytes(b"\x89PNG of nothing")
     read = read_mesh_file(tmp_path / name)
     moved = POINTS * (1, 2, 4) + 0.125
     assert write_posed(read, moved, tmp_path / "new" / "b.ply") == []
     written = (tmp_path / "new" / "b.ply").read_bytes()
-    assert (tmp_path / "new" / "skin.png").read_bytes() == b"\x89PNG of nothing"
+    assert (tmp_path / "new" / "skin of me.png").read_bytes() == PNG
     again = read_mesh_file(tmp_path / "new" / "b.ply")
     assert np.array_equal(again.mesh.vertices, moved) and np.array_equal(again.mesh.faces, read.mesh.faces)
     before, after = read.content.surface, again.content.surface
