@@ -15,7 +15,7 @@ from training.checkpoints.checkpoint import save_checkpoint
 from training.engine.trainer import train
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, write_rows
 from training.evaluation.tables import report
-from training.inference.predict import network_from
+from training.networks import network_from
 from training.reports.examples import draw_training_curve
 from training.tracking.record import begin_record, end_record, update_record
 

@@ -107,7 +107,7 @@ def test_nan_on_one_rank_stops_both_before_the_step(dataset: str, tmp_path: Path
     monkeypatch.setenv("FAULT_RANK", "1")
     monkeypatch.setenv("FAULT_STEP", "7")
     recipe = tiny_training(launcher="ray", ranks=2)
-    started = start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2, module="tests.support.faulty_rank")
+    started = start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2, module="tests.support.ranks.faulty_rank")
     (first, said), (second, said_by_culprit) = finish(started)
     assert first and second
     assert "not finite at step 7 (on another rank)" in said

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.common.errors import CompilerError
-from tests.support.one_rank import two_backward_passes
+from tests.support.ranks.one_rank import two_backward_passes
 from training.networks import build_network, execution
 from training.networks.execution import GraphedTransfer, compiled, precision
 

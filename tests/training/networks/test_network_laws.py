@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from tests.support.one_rank import two_backward_passes
+from tests.support.ranks.one_rank import two_backward_passes
 from tests.support.three_networks import FORMS, LITERAL, PAIRING, functional_gradients, initial, lively, pair
 from training.networks import NETWORKS, build_network
 from training.networks.layers import modulation, optimal_transport, pose_encoder

@@ -12,7 +12,7 @@ import yaml
 
 from training.recipes.training import TrainingRecipe
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def free_port() -> int:
