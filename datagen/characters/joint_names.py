@@ -3,9 +3,6 @@
 import re
 from collections.abc import Sequence
 
-PARTS = ("torso", "neck", "head", "ears", "forelimbs", "hindlimbs", "tail")
-"""Parts of a body, each of which may be scaled by itself."""
-
 _WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
 _SIDES = {"l": 1, "left": 1, "r": -1, "right": -1}
 _FORE = {"arm", "forearm", "hand", "elbow", "wrist", "finger", "thumb", "index", "middle", "ring", "pinky", "wing"}
@@ -32,8 +29,9 @@ def pairs(names: Sequence[str]) -> list[tuple[int, int]]:
 
 
 def parts(names: Sequence[str], parents: Sequence[int]) -> list[str]:
-    """The part of each joint: what its name says, or else its parent's part; a root without a telling name is torso.
+    """The part of each joint: torso, neck, head, ears, forelimbs, hindlimbs or tail.
 
+    It is what its name says, or else its parent's part; a root without a telling name is torso.
     The bone of a girdle lies inside of the torso, so that its joint counts as torso, although its name speaks of limbs.
     """
     found: list[str] = []

@@ -11,7 +11,7 @@ from datagen.common.errors import BodyError
 
 
 @dataclass(frozen=True)
-class Surface:
+class WeldedSkin:
     """``vertices`` [vertex, 3], ``faces`` [face, 3] that use them all, ``weights`` [vertex, joint] that sum to one."""
 
     vertices: NDArray[np.float64]
@@ -19,7 +19,7 @@ class Surface:
     weights: NDArray[np.float64]
 
 
-def weld(skin: Skin, *, name: str) -> Surface:
+def weld(skin: Skin, *, name: str) -> WeldedSkin:
     """The pieces of a skin as one surface, with every vertex once.
 
     Vertices are one where position and weights are the same, and at the ends of an edge without length. Their order is
@@ -43,7 +43,7 @@ def weld(skin: Skin, *, name: str) -> Surface:
     if not len(faces):
         raise BodyError(f"{name} has no face with an area. Export a triangle mesh")
     kept, faces = np.unique(faces, return_inverse=True)
-    return Surface(positions[kept], faces.reshape(-1, 3).astype(np.int32), weights[kept])
+    return WeldedSkin(positions[kept], faces.reshape(-1, 3).astype(np.int32), weights[kept])
 
 
 def volume(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:

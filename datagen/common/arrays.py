@@ -4,6 +4,4 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.floating]
-
-
 Integers = npt.NDArray[np.integer]

@@ -11,7 +11,6 @@ all objects of an OBJ file are one mesh, as they share its vertices; glTF with c
 
 import os
 import re
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,20 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import BodyError, MeshError, StorageError
+from datagen.common.errors import BodyError, MeshError, StorageError, storage_errors
 from datagen.common.files import write_atomically
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Content, Encoded, one_word
 from datagen.mesh.geometry import Mesh, check_mesh
-from datagen.mesh.limits import refuse_huge, require_file, require_known, require_thickness
+from datagen.mesh.limits import DAMAGE, refuse_huge, require_file, require_known, require_thickness
 
 if TYPE_CHECKING:
     from datagen.mesh.formats.glb_writer import Draft
-
-_DAMAGE = (
-    LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
-    np.linalg.LinAlgError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,7 @@ def _read(path: Path, geometry: str | None) -> MeshFile:
         raise MeshError(str(error)) from error
     except OSError as error:
         raise MeshError(f"{path} cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
     mesh = check_mesh(Mesh(vertices, faces), name=str(path))
@@ -209,10 +203,8 @@ def check_writable(out: Path) -> None:
     if out.is_dir():
         raise MeshError(f"{out} is a folder; name the file to write, for example {out / 'posed.obj'}")
     require_known(out)
-    try:
+    with storage_errors(f"to {out.parent}", advice=f"Choose another place for {out.name}"):
         out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"the folder {out.parent} cannot be made: {error.strerror or error}") from error
     if not os.access(out.parent, os.W_OK | os.X_OK):
         raise StorageError(f"the folder {out.parent} cannot be written to: choose another place for {out.name}")
 

@@ -26,6 +26,11 @@ _JSON_VALUES = 2**22  # of a glTF file; each takes some 100 bytes
 _BLOCK = 2**22
 _FLAT = 1e-6  # of the longest edge of the bounding box
 _SPACES = bytes.maketrans(b"\t\r\n\v\f", b"     ")
+DAMAGE = (
+    LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
+    np.linalg.LinAlgError,
+)  # fmt: skip
+"""What Python and NumPy raise on content that is not as its format wants it."""
 
 
 def refuse_huge(path: Path) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from datagen.common.arrays import Floats
 from datagen.common.errors import DsffnetError
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from training.inference.orientation import POOR_ERROR, TURN, Axes, Orientation, axes_as_options
@@ -23,7 +24,6 @@ from training.tracking.provenance import FILE, Provenance, provenance_of
 if TYPE_CHECKING:
     from datagen.store import Dataset
 
-Floats = NDArray[np.floating]
 _TIMES_AS_MANY = 10.0  # vertices than training saw
 _PROPORTIONS_BEYOND = 1.5  # times the range of training
 _STRAY_SHARE, _STRAY_TIMES = 0.01, 2.0  # so few vertices that make the box so many times larger

@@ -18,10 +18,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.common.arrays import Floats
 from datagen.common.errors import RecipeError
 from datagen.mesh.geometry import bounding_box
 
-Floats = NDArray[np.floating]
 SelfErrors = Callable[[Floats], NDArray[np.float64]]
 """Meshes [b, n, 3] in the normalised box -> PMD [b] of each when it is transferred onto itself."""
 

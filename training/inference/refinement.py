@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
+from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, edges_of
 
-Floats = NDArray[np.floating]
 _STEPS = 8
 
 

@@ -17,13 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
 from training.networks.execution import GraphedTransfer, Precision
 from training.objectives.metrics import point_mesh_distance
 
-Floats = NDArray[np.floating]
 _VERTICES_AT_ONCE = 8192  # of self-transfers, so that memory stays bounded
 REFINE_WEIGHT = 6.0
 """The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/transfer.md)."""

@@ -6,22 +6,20 @@ nodes and their names, materials, textures and texture coordinates are kept. Tan
 again, as the glTF specification has it (3.7.2.1).
 """
 
-import base64
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import MeshError, UnsafeFileError
-from datagen.common.files import read_bounded, resolve_within
+from datagen.common.errors import MeshError
 from datagen.mesh.formats.glb_export import built_glb
 from datagen.mesh.formats.glb_writer import Block, Draft, GlbParts, Json
-from datagen.mesh.formats.gltf import LARGEST, SOLID, Gltf, triangles
-from datagen.mesh.formats.surface import Encoded, Format, Image, Material, Surface, numbered, srgb
+from datagen.mesh.formats.gltf import SOLID, Gltf, triangles
+from datagen.mesh.formats.gltf_materials import base_texture, image_bytes, read_material
+from datagen.mesh.formats.surface import Alone, Encoded, Format, Image, Surface, numbered, srgb
 from datagen.mesh.limits import require_counts
 
 
@@ -62,51 +60,6 @@ def solid_nodes(file: Gltf) -> dict[str, int]:
     return found
 
 
-def base_texture(file: Gltf, number: int) -> Json:
-    """How a material names the texture of its base colour; nothing for no material."""
-    materials = file.json.get("materials", [])
-    if not 0 <= number < len(materials):
-        return {}
-    return materials[number].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-
-
-def read_material(file: Gltf, number: int) -> Material:
-    """Name, base colour and its texture."""
-    material = file.json["materials"][number]
-    look = material.get("pbrMetallicRoughness", {})
-    red, green, blue, alpha = map(float, look.get("baseColorFactor", (1, 1, 1, 1)))
-    texture = base_texture(file, number).get("index")
-    image = None
-    if texture is not None and "source" in file.json["textures"][texture]:
-        image = _image(file, file.json["textures"][texture]["source"])
-    return Material(str(material.get("name") or f"material_{number}"), (red, green, blue, alpha), image)
-
-
-def _image(file: Gltf, number: int) -> Image | None:
-    image = file.json["images"][number]
-    content = image_bytes(file, image)
-    return Image(str(image.get("name") or f"image_{number}"), content) if content is not None else None
-
-
-def image_bytes(file: Gltf, image: Json) -> bytes | None:
-    """The bytes of an image inside the file, or in a file beside it; None where they are nowhere."""
-    content = _image_content(file, image)
-    file.require_room(("image", id(image)), len(content or b""))
-    return content
-
-
-def _image_content(file: Gltf, image: Json) -> bytes | None:
-    if "bufferView" in image:
-        return file.view(image["bufferView"])
-    uri = str(image.get("uri", ""))
-    if uri.startswith("data:"):
-        return base64.b64decode(uri.partition(",")[2])
-    try:  # another's files are not to be carried off
-        return read_bounded(resolve_within(file.path.parent, unquote(uri)), limit=LARGEST)
-    except (UnsafeFileError, OSError, ValueError):
-        return None
-
-
 _KEPT_ON_PRIMITIVES = ("KHR_materials_variants",)
 _DERIVED = ("POSITION", "NORMAL", "TANGENT", "JOINTS_", "WEIGHTS_")
 
@@ -121,8 +74,8 @@ class Piece:
     corners: NDArray[np.int64]
 
 
-class GlbContent:
-    """One mesh of a GLB file."""
+class GlbContent(Alone):
+    """One mesh of a GLB file; textures that lie beside it are written into the new one."""
 
     def __init__(self, file: Gltf, name: str, node: int) -> None:
         self.name: str | None = name
@@ -266,10 +219,6 @@ class GlbContent:
             "lines and points": len(self._pieces) < len(self._mesh["primitives"]),
         }
         return [name for name, there in parts.items() if there]
-
-    def companions(self) -> Encoded:
-        """None: textures that lie beside a GLB file are written into the new one."""
-        return Encoded(b"")
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
         """The file with other positions and normals, without what moved it before."""

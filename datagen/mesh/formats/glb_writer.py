@@ -109,10 +109,8 @@ class Draft:
         found = [local[self.of]]
         if self.group is not None:
             assert self.surface.shading is not None
-            normals = np.tile([0.0, 1.0, 0.0], (int(self.group.max()) + 1, 1))
-            some = shared_normals(local, self.surface, self.surface.shading)
-            normals[: len(some)] = some
-            found.append(normals[self.group])
+            groups = int(self.group.max()) + 1
+            found.append(shared_normals(local, self.surface, self.surface.shading, count=groups)[self.group])
         return [[each[block.vertices].astype(np.float32) for each in found] for block in self.blocks]
 
     def static(self, vertices: NDArray[np.float64]) -> bytes:

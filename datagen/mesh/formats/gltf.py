@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.common.errors import BodyError, UnsafeFileError
 from datagen.common.files import read_bounded, resolve_within
-from datagen.mesh.limits import parse_json
+from datagen.mesh.limits import DAMAGE, parse_json
 
 SUFFIXES = (".glb", ".gltf")
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -34,11 +34,6 @@ _LISTS = ("nodes", "accessors", "bufferViews", "buffers", "skins", "meshes", "an
 LARGEST = 2**30
 """Bytes at most of a file, of the files beside it, and of all that is taken out of it; a million vertices' positions
 have 12 MB."""
-_DAMAGE = (
-    LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, struct.error,
-    np.linalg.LinAlgError,
-)  # fmt: skip
-
 Json = dict[str, Any]
 
 
@@ -47,7 +42,7 @@ def reading(path: Path, part: str = "") -> Iterator[None]:
     """Turn what Python raises on content that is not as the specification wants it into one BodyError."""
     try:
         yield
-    except _DAMAGE as error:
+    except DAMAGE as error:
         what = f"{part} cannot be read, " if part else ""
         raise BodyError(
             f"{path} is damaged ({what}{type(error).__name__}: {error}). Export or copy it again"
@@ -256,7 +251,7 @@ class Gltf:
             return parsed
         except OSError as error:
             raise BodyError(f"{self.path} cannot be read: {error.strerror}") from error
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise BodyError(f"{self.path} is not a sound glTF 2.0 file ({error}). Export or copy it again") from error
 
     def _json_chunk(self, content: bytes) -> bytes:

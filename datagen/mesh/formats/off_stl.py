@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh.formats.surface import Encoded, Format, Surface, numbered, numbers, one_mesh, shared_normals, unit
+from datagen.mesh.formats.surface import (
+    Alone,
+    Encoded,
+    Format,
+    Surface,
+    numbered,
+    numbers,
+    one_mesh,
+    shared_normals,
+    unit,
+)
 from datagen.mesh.limits import is_binary_stl
 
 _STL_HEADER = 80
@@ -17,7 +27,7 @@ _ROWS_AT_ONCE = 2**16
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-class OffContent:
+class OffContent(Alone):
     """The text of an OFF file: colours, comments and quads are kept; binary and 4-D ones are refused."""
 
     name: str | None = None
@@ -66,19 +76,13 @@ class OffContent:
         """The same text with other positions, and normals that follow them."""
         columns = vertices
         if self._has_normals:
-            normals = np.tile([0.0, 1.0, 0.0], (len(vertices), 1))
-            found = shared_normals(vertices, self.surface, self.surface.corners)
-            normals[: len(found)] = found
+            normals = shared_normals(vertices, self.surface, self.surface.corners, count=len(vertices))
             columns = np.concatenate([vertices, normals], axis=1)
         lines = list(self._lines)
         for number, (row, values) in enumerate(zip(self._rows, columns.tolist(), strict=True)):
             words = [b"%.9g" % value for value in values]
             lines[self._told[self._first + number]] = b" ".join(words + row[len(words) :])
         return Encoded(b"\n".join(lines) + b"\n")
-
-    def companions(self) -> Encoded:
-        """None."""
-        return Encoded(b"")
 
 
 def _colours(rows: list[list[bytes]]) -> NDArray[np.uint8] | None:
@@ -110,7 +114,7 @@ def _built_off(surface: Surface, vertices: NDArray[np.float64], name: str, stem:
     return Encoded("\n".join([*lines, ""]).encode(), {}, left_out)
 
 
-class StlContent:
+class StlContent(Alone):
     """The triangles of an STL file, text or binary. Corners at exactly one place become one vertex, as first met."""
 
     only_here: list[str]
@@ -144,10 +148,6 @@ class StlContent:
         if not self._binary:
             return Encoded(_stl_text(at, self.name or ""))
         return Encoded(_stl_bytes(at, self._header, self._triangles["attribute"]))
-
-    def companions(self) -> Encoded:
-        """None."""
-        return Encoded(b"")
 
 
 def _text_corners(content: bytes) -> NDArray[np.float64]:

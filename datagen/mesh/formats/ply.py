@@ -99,9 +99,8 @@ class PlyContent:
         columns = {axis: vertices[:, number] for number, axis in enumerate("xyz")}
         if self._group is not None:
             surface = self.surface
-            normals = np.tile([0.0, 1.0, 0.0], (int(self._group.max()) + 1, 1))
-            found = shared_normals(vertices, surface, self._group[surface.corners])
-            normals[: len(found)] = found
+            groups = int(self._group.max()) + 1
+            normals = shared_normals(vertices, surface, self._group[surface.corners], count=groups)
             columns |= {name: normals[self._group, axis] for axis, name in enumerate(_NORMALS)}
         write = self._text if self._header.form == "ascii" else self._binary
         return Encoded(write(self._tables["vertex"], columns))
@@ -151,10 +150,8 @@ def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str
     columns: list[tuple[str, str, NDArray[Any]]] = [(axis, "f4", vertices[:, n]) for n, axis in enumerate("xyz")]
     left_out = []
     if surface.shading is not None:
-        normals = shared_normals(vertices, surface, surface.corners)
-        filled = np.tile([0.0, 1.0, 0.0], (len(vertices), 1))
-        filled[: len(normals)] = normals
-        columns += [(name, "f4", filled[:, axis]) for axis, name in enumerate(_NORMALS)]
+        normals = shared_normals(vertices, surface, surface.corners, count=len(vertices))
+        columns += [(name, "f4", normals[:, axis]) for axis, name in enumerate(_NORMALS)]
         left_out += ["sharp edges: normals are smooth"] if _is_sharp(surface) else []
     if surface.colours is not None:
         columns += [(name, "u1", surface.colours[:, n]) for n, name in enumerate(_COLOURS)]

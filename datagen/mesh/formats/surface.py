@@ -118,6 +118,14 @@ class Content(Protocol):
         """Files that this one names, to be copied along (``content`` is empty)."""
 
 
+class Alone:
+    """Content that names no files beside it."""
+
+    def companions(self) -> Encoded:
+        """Nothing."""
+        return Encoded(b"")
+
+
 @dataclass(frozen=True)
 class Format:
     """How the files of a format are read and built.
@@ -143,17 +151,19 @@ def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, str |
     return read
 
 
-def shared_normals(vertices: NDArray[np.float64], surface: Surface, shading: NDArray[np.int64]) -> NDArray[np.float64]:
+def shared_normals(
+    vertices: NDArray[np.float64], surface: Surface, shading: NDArray[np.int64], *, count: int = 0
+) -> NDArray[np.float64]:
     """Unit normals [group, 3] of groups of corners: the mean of their polygons' normals, weighted by area.
 
-    ``vertices`` [n, 3]; ``shading`` [corner] as in :class:`Surface`, -1 for corners without a normal.
-    A group without area gets +Y.
+    ``vertices`` [n, 3]; ``shading`` [corner] as in :class:`Surface`, -1 for corners without a normal; ``count``: groups
+    at least. A group without area gets +Y.
     """
     at = vertices[surface.faces]
     doubled = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
     shaded = shading >= 0
     area = [np.bincount(surface.polygon_of_face, doubled[:, axis], len(surface.sizes)) for axis in range(3)]
-    summed = [np.bincount(shading[shaded], np.repeat(each, surface.sizes)[shaded]) for each in area]
+    summed = [np.bincount(shading[shaded], np.repeat(each, surface.sizes)[shaded], count) for each in area]
     return unit(np.stack(summed, axis=1))
 
 

@@ -145,7 +145,7 @@ def test_what_cannot_be_an_animation_leaves_nothing(tmp_path: Path, monkeypatch:
         write_animation(read, frames[:2], out, frames_per_second=10)
     assert not list((tmp_path / "out").iterdir())
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="cannot be made"):
+    with pytest.raises(StorageError, match=r"could not write to .*: "):
         write_animation(read, frames, tmp_path / "file" / "moving.glb", frames_per_second=10)
 
 
