@@ -26,7 +26,7 @@ class Track:
     interpolation: str
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """Unit quaternion [4] at ``time``; before the first and after the last key, that key's."""
+        """Return the unit quaternion [4] at ``time``; before the first and after the last key, that key's."""
         cubic = self.interpolation == _CUBIC
         values = self.values[:, 1] if cubic else self.values
         after = int(np.searchsorted(self.times, time, side="right"))
@@ -53,7 +53,7 @@ class Clip:
 
 
 def read_clips(file: Gltf) -> dict[str, Clip]:
-    """The clips by name, in the file's order; those that turn nothing are left out.
+    """Return the clips by name, in the file's order; those that turn nothing are left out.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def world_frames(file: Gltf, clip: Clip, time: float, nodes: Sequence[int]) -> N
     for node, track in clip.rotations.items():
         rotations[node] = track.at(time)
     if not np.isfinite(rotations).all():
-        raise BodyError(f"{file.path}: clip {clip.name!r} has a key near {time:.2f} s that is no rotation. Mend it")
+        raise BodyError(f"{file.path}: clip {clip.name!r} has a key near {time:.2f} s that is no rotation. Repair it")
     frames = Rotation.from_quat(rotations).as_matrix() * file.scales[:, None, :]
     for node in file.order:
         parent = file.parents[node]

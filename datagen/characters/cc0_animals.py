@@ -48,7 +48,7 @@ def cache_folder() -> Path:
 
 
 def animal_files() -> list[Path]:
-    """The twelve .glb files, by name; they are fetched into the cache if they are not there yet.
+    """Return the twelve .glb files, by name; they are fetched into the cache if they are not there yet.
 
     Raises
     ------

@@ -92,7 +92,7 @@ def load_characters(path: str, chosen: Sequence[str] = (), *, vertices: int | No
 
 
 def shared_joints(characters: Sequence[Character]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Names and parents of the joints that all characters have, in the order and the tree of the first one.
+    """Return the names and parents of the joints that all characters have, in the order and the tree of the first one.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def shared_joints(characters: Sequence[Character]) -> tuple[tuple[str, ...], tup
 
 @lru_cache(maxsize=64)
 def load_character(path: Path) -> Character:
-    """The character in a file, read once a process.
+    """Return the character in a file, read once a process.
 
     Raises
     ------

@@ -10,10 +10,11 @@ _GIRDLES = {"clavicle", "collar", "shoulder"}
 _FORE |= _GIRDLES
 _LIMB = _FORE | {"leg", "foot", "thigh", "calf", "shin", "knee", "ankle", "toe", "toes", "paw", "hoof", "hip"}
 _HEAD = {"head", "jaw", "mouth", "eye", "horn", "antler", "tongue", "snout", "skull"}
+_PLAIN = [("ears", {"ear", "ears"}), ("tail", {"tail"}), ("neck", {"neck"}), ("head", _HEAD)]
 
 
 def words(name: str) -> list[str]:
-    """The words of a name, in lower case: ``IKBackLeg.L`` -> ik, back, leg, l; ``lThigh`` -> l, thigh."""
+    """Return the words of a name, in lower case: ``IKBackLeg.L`` -> ik, back, leg, l; ``lThigh`` -> l, thigh."""
     return [word.lower() for word in re.findall(_WORD, name)]
 
 
@@ -25,11 +26,11 @@ def side(name: str) -> int:
 def pairs(names: Sequence[str]) -> list[tuple[int, int]]:
     """Numbers (left, right) of joints whose names differ in their side only."""
     at = {(_without_side(name), side(name)): number for number, name in enumerate(names)}
-    return [(number, at[key, -1]) for (key, its), number in at.items() if its == 1 and (key, -1) in at]
+    return [(number, at[key, -1]) for (key, which), number in at.items() if which == 1 and (key, -1) in at]
 
 
 def parts(names: Sequence[str], parents: Sequence[int]) -> list[str]:
-    """The part of each joint: torso, neck, head, ears, forelimbs, hindlimbs or tail.
+    """Return the part of each joint: torso, neck, head, ears, forelimbs, hindlimbs or tail.
 
     It is what its name says, or else its parent's part; a root without a telling name is torso.
     The bone of a girdle lies inside of the torso, so that its joint counts as torso, although its name speaks of limbs.
@@ -44,17 +45,16 @@ def parts(names: Sequence[str], parents: Sequence[int]) -> list[str]:
 
 
 def part_in(name: str) -> str | None:
-    """The part that a joint's own name tells, if it does."""
-    said = set(words(name))
-    plain = [("ears", {"ear", "ears"}), ("tail", {"tail"}), ("neck", {"neck"}), ("head", _HEAD)]
-    for part, telling in plain:
-        if said & telling:
+    """Return the part that a joint's own name tells, if it does."""
+    found = set(words(name))
+    for part, words_of_part in _PLAIN:
+        if found & words_of_part:
             return part
-    if not said & _LIMB:
-        return "torso" if said & {"spine", "torso", "chest", "pelvis", "hips", "back"} else None
-    if said & {"back", "hind", "rear"}:
+    if not found & _LIMB:
+        return "torso" if found & {"spine", "torso", "chest", "pelvis", "hips", "back"} else None
+    if found & {"back", "hind", "rear"}:
         return "hindlimbs"
-    return "forelimbs" if said & (_FORE | {"front", "fore"}) else "hindlimbs"
+    return "forelimbs" if found & (_FORE | {"front", "fore"}) else "hindlimbs"
 
 
 def _girdle(name: str) -> bool:

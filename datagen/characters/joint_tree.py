@@ -23,7 +23,7 @@ class Tree:
     parents: tuple[int, ...]
 
     def restricted(self, names: set[str]) -> "Tree":
-        """The tree of the joints called ``names`` alone; each hangs on its nearest ancestor among them."""
+        """Return the tree of the joints called ``names`` alone; each hangs on its nearest ancestor among them."""
         kept = [joint for joint, name in enumerate(self.names) if name in names]
         parents = nearest_above(self.parents, kept)
         return Tree(tuple(self.names[joint] for joint in kept), tuple(parents))
@@ -43,7 +43,7 @@ def nearest_above(parents: Sequence[int], kept: Sequence[int]) -> list[int]:
 def joint_tree(
     file: Gltf, nodes: Sequence[int], weights: NDArray[np.float64], places: NDArray[np.floating]
 ) -> tuple[Tree, list[int]]:
-    """The tree of a skin's joints that move something, and their numbers within the skin.
+    """Return the tree of a skin's joints that move something, and their numbers within the skin.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def _subtree(parents: Sequence[int], root: int) -> list[int]:
 def _ears_on_head(names: list[str], parents: list[int]) -> list[int]:
     """Hang ears that are siblings of the head on it: where a pose turns the head and knows no ears, they go along."""
     part = [part_in(name) for name in names]
-    heads = {parents[joint]: joint for joint, its in enumerate(part) if its == "head"}
+    heads = {parents[joint]: joint for joint, name in enumerate(part) if name == "head"}
     return [
         heads.get(parent, parent) if part[joint] == "ears" and part[parent] not in ("ears", "head") else parent
         for joint, parent in enumerate(parents)

@@ -11,7 +11,7 @@ from datagen.common.errors import BodyError
 def simplify(
     vertices: NDArray[np.float64], faces: NDArray[np.int32], weights: scipy.sparse.csr_array, count: int, *, name: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], scipy.sparse.csr_array]:
-    """The same surface with about ``count`` vertices; one that has no more is returned as it is.
+    """Return the same surface with about ``count`` vertices; one that has no more is returned as it is.
 
     Parameters
     ----------

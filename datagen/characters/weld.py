@@ -20,7 +20,7 @@ class WeldedSkin:
 
 
 def weld(skin: Skin, *, name: str) -> WeldedSkin:
-    """The pieces of a skin as one surface, with every vertex once.
+    """Return the pieces of a skin as one surface, with every vertex once.
 
     Vertices are one where position and weights are the same, and at the ends of an edge without length. Their order is
     that of their first occurrence.
@@ -61,9 +61,9 @@ def _weights(piece: Primitive, joints: int) -> NDArray[np.float64]:
 
 def _require_usable(positions: NDArray[np.float64], weights: NDArray[np.float64], name: str) -> None:
     if not np.isfinite(positions).all():
-        raise BodyError(f"{name} has vertices that are not finite. Mend the mesh, export it again")
+        raise BodyError(f"{name} has vertices that are not finite. Repair the mesh and export it again")
     if not np.isfinite(weights).all() or (weights < 0).any():
-        raise BodyError(f"{name} has weights that are negative or not finite. Mend them, export it again")
+        raise BodyError(f"{name} has weights that are negative or not finite. Repair them and export it again")
     lost = np.flatnonzero(weights.sum(axis=1) <= 0)
     if len(lost):
         raise BodyError(f"{name} has {len(lost)} vertices that no joint moves. Bind them to a joint, export it again")

@@ -17,7 +17,7 @@ class Asset:
 
 
 def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
-    """A file as an asset, known by the sha256 of its bytes.
+    """Return a file as an asset, known by the sha256 of its bytes.
 
     Raises
     ------

@@ -17,7 +17,7 @@ _WORDS = ("can't allocate memory", "not enough memory", "out of memory", "CUBLAS
 
 
 def bytes_text(size: float) -> str:
-    """Bytes as a person reads them."""
+    """Return a number of bytes as a person reads it."""
     if size == float("inf"):
         return "more than any number of bytes"
     for unit, factor in _UNITS:
@@ -27,7 +27,7 @@ def bytes_text(size: float) -> str:
 
 
 def free_memory() -> int:
-    """Bytes of memory that are free on this machine, or within the limit of the container that it runs in."""
+    """Return the bytes of memory that are free on this machine, or within the limit of its container."""
     return min(int(psutil.virtual_memory().available), container_memory())
 
 
@@ -44,14 +44,14 @@ def container_memory(cgroup: Path = _CGROUP) -> int:
 
 
 def free_disk(folder: Path) -> int:
-    """Bytes that are free on the disk on which a folder lies or will lie."""
+    """Return the bytes that are free on the disk on which a folder lies or will lie."""
     whole = folder.absolute()
     there = next(place for place in (whole, *whole.parents) if os.path.exists(place))  # Path's raises if not permitted
     return shutil.disk_usage(there).free
 
 
 def ran_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out: Python's and NumPy's MemoryError, torch's of either device."""
+    """Return whether an error says that memory ran out: Python's and NumPy's MemoryError, torch's of either device."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     return isinstance(error, RuntimeError) and any(word in str(error) for word in _WORDS)

@@ -17,5 +17,5 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
-    """A counter-based generator whose draws depend on nothing but its three arguments."""
+    """Return a counter-based generator whose draws depend on nothing but its three arguments."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence((seed, int(stream), index))))

@@ -180,7 +180,7 @@ def _write_beside(out: Path, name: str, content: bytes) -> list[str]:
 
 
 def draft_of(original: MeshFile) -> "Draft":
-    """The original as a GLB file that lacks only its positions."""
+    """Return the original as a GLB file that lacks only its positions."""
     from datagen.mesh.formats.glb import GlbContent
     from datagen.mesh.formats.glb_export import built_draft
 

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 VERTEX_LIMIT = 2_000_000
 """Vertices of a mesh at most; bodies for animation have a thousandth of it. What they take: docs/transfer.md."""
 BYTE_LIMIT = 2**30
+FRAME_LIMIT = 2_000
+"""Frames of an animation at most."""
+GLB_LIMIT = 2**32 - 2**16
+"""Bytes of a GLB file that is written; it counts them in 32 bits."""
 _CORNER_LIMIT = 12 * VERTEX_LIMIT  # of faces: a closed surface has two triangles a vertex, an open or torn one fewer
 _LINE_LIMIT = 15 * VERTEX_LIMIT  # of a text: STL has seven lines a triangle
 _WORD_LIMIT = 24 * VERTEX_LIMIT  # of a text: OBJ has some 19 words a vertex

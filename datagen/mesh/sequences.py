@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from datagen.common.errors import MeshError
 from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
 from datagen.mesh.formats import FORMATS
+from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT, require_known
 
 INTERPOLATIONS = ("LINEAR", "STEP")
 
 
 def frames_of(path: str | Path) -> list[Path]:
-    """The mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
+    """Return the mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
 
     The series of a numbered file are the files beside it that differ from it in that number alone.
 
@@ -46,7 +47,7 @@ def frames_of(path: str | Path) -> list[Path]:
 
 
 def is_pattern(path: Path) -> bool:
-    """Whether a path stands for several files; one that is there under this very name does not."""
+    """Return whether a path stands for several files; one that is there under this very name does not."""
     return not path.exists() and (any(sign in path.name for sign in "*?[") or bool(_NUMBER.search(path.name)))
 
 
@@ -59,8 +60,7 @@ def _is_mesh(path: Path) -> bool:
 
 def _series(path: Path) -> list[Path]:
     """Files beside one that differ from it in its last number alone."""
-    if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+    require_known(path)
     parts = re.fullmatch(r"(.*?)(\d+)(\D*)", path.stem)
     if not parts:
         return [path]
@@ -81,12 +81,10 @@ def require_animation(original: MeshFile, frames: int) -> None:
     MeshError
         They are more than ``FRAME_LIMIT``, or than 4 GiB.
     """
-    from datagen.mesh.formats.glb_writer import FRAME_LIMIT, LARGEST
-
     if frames > FRAME_LIMIT:
         raise MeshError(f"{frames:,} frames are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere")
     size = frames * draft_of(original).frame_bytes
-    if size > LARGEST:
+    if size > GLB_LIMIT:
         raise MeshError(f"{frames:,} frames of {original.path} need {size:,} bytes, an animated GLB holds 4 GiB")
 
 

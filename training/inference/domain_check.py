@@ -53,7 +53,7 @@ def seen_in(dataset: "Dataset") -> Seen:
 
 
 def noted(seen: Seen) -> dict[str, Any]:
-    """What a run writes down under ``seen`` in its provenance.json; ``proportions`` are least and most."""
+    """Return what a run writes down under ``seen`` in its provenance.json; ``proportions`` are least and most."""
     return {"vertices": list(seen.vertices), "proportions": [seen.least.tolist(), seen.most.tolist()]}
 
 
@@ -101,7 +101,7 @@ def _spread(count: int, wanted: int) -> NDArray[np.int64]:
 
 
 def remarks(
-    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], told: bool, seen: Seen | None
+    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], stated: bool, seen: Seen | None
 ) -> Iterator[str]:
     """One line for everything about a mesh that its network has not met.
 
@@ -111,16 +111,16 @@ def remarks(
         As it is in its file.
     name
         What the lines call it.
-    axes, way, both, told
+    axes, way, both, stated
         How it is taken to stand, how well it comes back in every way of standing, how source and target seem to stand,
         and whether a person said how.
     seen
         What the network saw, None where that is not known.
     """
     upright = axes.turned(mesh.vertices)
-    fits = way.error(axes) <= POOR_ERROR if told else way.fits(axes)
+    fits = way.error(axes) <= POOR_ERROR if stated else way.fits(axes)
     if not fits:
-        yield _about_standing(name, axes, way, None if told else both)
+        yield _about_standing(name, axes, way, None if stated else both)
     yield from _about_parts(name, mesh)
     yield from _about_box(name, upright, seen if fits else None)
     yield from _about_count(name, len(upright), seen)
@@ -168,11 +168,11 @@ def _about_box(name: str, upright: Floats, seen: Seen | None) -> Iterator[str]:
     if strays:
         yield f"{name} has {strays} vertices far from all others, which shrink the body in its box: remove them"
     elif shape.min() < _FLAT:
-        yield f"{name} is nearly flat (box {_told(shape)} of its longest edge): is one of its axes lost?"
+        yield f"{name} is nearly flat (box {_as_text(shape)} of its longest edge): is one of its axes lost?"
     elif seen and _is_beyond(shape, seen):
         yield (
-            f"{name} has a box of {_told(shape)} (width, height, depth over the longest), training saw "
-            f"{_told(seen.least)} to {_told(seen.most)}: expect less, or train on such bodies"
+            f"{name} has a box of {_as_text(shape)} (width, height, depth over the longest), training saw "
+            f"{_as_text(seen.least)} to {_as_text(seen.most)}: expect less, or train on such bodies"
         )
 
 
@@ -206,5 +206,5 @@ def _proportions(vertices: Floats) -> Floats:
     return np.asarray(edges / max(float(edges.max()), 1e-30))
 
 
-def _told(shape: Floats) -> str:
+def _as_text(shape: Floats) -> str:
     return " x ".join(f"{edge:.2f}" for edge in shape)

@@ -102,7 +102,7 @@ def axes_of_both(up: str, front: str) -> tuple[Axes, Axes]:
 
 
 def axes_as_options(source: Axes, target: Axes) -> str:
-    """What :func:`axes_of_both` reads, as it is typed."""
+    """Return what :func:`axes_of_both` reads, as it is typed."""
     ups, fronts = ((source.up, target.up), (source.front, target.front))
     alike = source == target
     return f"--up={ups[0] if alike else ','.join(ups)} --front={fronts[0] if alike else ','.join(fronts)}"
@@ -145,7 +145,7 @@ class Orientation:
         return bool(self.turned.min() <= _BETWEEN * self.errors.min())
 
     def fits(self, axes: Axes) -> bool:
-        """Whether nothing speaks against a mesh that stands by ``axes``."""
+        """Return whether nothing speaks against a mesh that stands by ``axes``."""
         return self.error(axes) <= min(POOR_ERROR, _NEARLY * float(self.errors.min())) and not self.is_between
 
     def error(self, axes: Axes) -> float:

@@ -20,7 +20,7 @@ _MESHES_AT_ONCE = 8
 
 
 def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, TrainingRecipe, int]:
-    """The network of a run with its weights, the recipe it was trained by, and the step.
+    """Return the network of a run with its weights, the recipe it was trained by, and the step.
 
     The weights are the newest sound ones or, where early stopping ended the run, the best; or those of ``which``.
 

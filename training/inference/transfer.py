@@ -99,7 +99,7 @@ class PoseTransfer:
         source_axes: Axes = UPRIGHT,
         target_axes: Axes = UPRIGHT,
     ) -> Iterator[Mesh]:
-        """The target in the pose of each source, one after the other; memory holds one window of frames.
+        """Yield the target in the pose of each source, one after the other; memory holds one window of frames.
 
         Every source is normalised by its own box, as each was in training: with one box for all, a body that crouches
         or has walked away would be a small one in a corner, such as no network has seen. What the boxes take away, the
@@ -182,16 +182,16 @@ class RootTrajectory:
 
     @classmethod
     def from_first(cls, source: Floats, output_scale: float) -> "RootTrajectory":
-        """A trajectory that begins where the target stands; ``source`` [n, 3] is the first frame, Y up."""
+        """Return a trajectory that begins where the target stands; ``source`` [n, 3] is the first frame, Y up."""
         return cls(standing_point(source), output_scale / float(bounding_box(source).half))
 
     def offset(self, source: Floats) -> Floats:
-        """How far [3] the output of this frame is from where the first one stands."""
+        """Return how far [3] the output of this frame is from where the first one stands."""
         return (standing_point(source) - self.start) * self.ratio
 
 
 def scale_of(target: Mesh, vertices: Floats) -> float:
-    """How many units of the target one unit of the output's box is; vertices [n, 3] in the normalised box."""
+    """Return how many units of the target one unit of the output's box is; vertices [n, 3] in the normalised box."""
     before, after = (_side_lengths(each, target.faces) for each in (target.vertices, vertices))
     usable = (after > _NO_LENGTH) & (before > 0)
     return float(np.median(before[usable] / after[usable])) if usable.any() else 1.0

@@ -56,7 +56,9 @@ class TransferWork:
             both = ways[0].axes, ways[1].axes
             if self.job.axes is None and not way.is_certain:
                 warn(f"--align leaves {path} as it is: how it stands is not certain")
-            for line in remarks(mesh, name=str(path), axes=axes, way=way, both=both, told=self.job.is_told, seen=seen):
+            for line in remarks(
+                mesh, name=str(path), axes=axes, way=way, both=both, stated=self.job.is_told, seen=seen
+            ):
                 warn(line)
 
     def run(self) -> str:

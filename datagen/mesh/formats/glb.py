@@ -221,11 +221,11 @@ class GlbContent(Alone):
         return [name for name, there in parts.items() if there]
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The file with other positions and normals, without what moved it before."""
+        """Return the file with other positions and normals, without what moved it before."""
         return Encoded(self.draft().static(vertices), {}, self._lost)
 
     def draft(self) -> Draft:
-        """The file without this mesh's positions and normals, to be filled in."""
+        """Return the file without this mesh's positions and normals, to be filled in."""
         parts = GlbParts({k: v for k, v in self._file.json.items() if k not in _REBUILT})
         copied: dict[int, int] = {}
         primitives = [self._primitive(piece, parts, copied) for piece in self._pieces]

@@ -14,7 +14,7 @@ def built_glb(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
 
 
 def built_draft(surface: Surface, count: int, name: str) -> tuple[Draft, list[str]]:
-    """A file that lacks only positions and normals, and what it cannot hold.
+    """Return a file that lacks only positions and normals, and what it cannot hold.
 
     A glTF vertex has one texture coordinate and one normal. So the mesh's vertices come first, in their order, and
     those that a seam or a sharp edge passes through follow once more for each further side.

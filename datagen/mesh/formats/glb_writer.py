@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from datagen.common.errors import MeshError
 from datagen.common.files import atomic_file
 from datagen.mesh.formats.surface import Surface, shared_normals
+from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT
 
-FRAME_LIMIT = 2_000
-LARGEST = 2**32 - 2**16
-"""Bytes of a GLB file, which counts them in 32 bits."""
 Json = dict[str, Any]
 _KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 9: "MAT3", 16: "MAT4"}
@@ -114,7 +112,7 @@ class Draft:
         return [[each[block.vertices].astype(np.float32) for each in found] for block in self.blocks]
 
     def static(self, vertices: NDArray[np.float64]) -> bytes:
-        """The file with these vertices [n, 3]."""
+        """Return the file with these vertices [n, 3]."""
         return b"".join(_glb(self._filled(self.arrays(vertices)), 0))
 
     def _filled(self, arrays: list[list[NDArray[np.float32]]]) -> GlbParts:
@@ -141,7 +139,7 @@ class Draft:
             if targets:
                 self._animate(len(targets), targets, spool.tell(), frames_per_second, interpolation)
             size = parts.length + spool.tell()
-            if size > LARGEST:
+            if size > GLB_LIMIT:
                 raise MeshError(
                     f"{out}: {len(targets) + 1} frames need {size:,} bytes, a GLB file holds 4 GiB: use fewer"
                 )

@@ -245,8 +245,8 @@ class Gltf:
             if str(parsed["asset"]["version"]).split(".")[0] != "2":
                 raise ValueError(f"glTF version {parsed['asset']['version']}")
             for name in _LISTS:
-                its = parsed.get(name, [])
-                if not isinstance(its, list) or not all(isinstance(each, dict) for each in its):
+                values = parsed.get(name, [])
+                if not isinstance(values, list) or not all(isinstance(each, dict) for each in values):
                     raise ValueError(f"{name} is not a list of objects")
             return parsed
         except OSError as error:
@@ -302,7 +302,7 @@ TRIANGLES, STRIP, FAN = SOLID = (4, 5, 6)
 
 
 def triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    """Triangles [face, 3] of a list, strip or fan (3.7.2.1), all wound alike."""
+    """Return triangles [face, 3] of a list, strip or fan (3.7.2.1), all wound alike."""
     if mode == TRIANGLES:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     if mode == FAN:

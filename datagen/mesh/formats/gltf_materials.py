@@ -10,7 +10,7 @@ from datagen.mesh.formats.surface import Image, Material
 
 
 def base_texture(file: Gltf, number: int) -> Json:
-    """How a material names the texture of its base colour; nothing for no material."""
+    """Return how a material names the texture of its base colour; nothing for no material."""
     materials = file.json.get("materials", [])
     if not 0 <= number < len(materials):
         return {}
@@ -36,7 +36,7 @@ def _image(file: Gltf, number: int) -> Image | None:
 
 
 def image_bytes(file: Gltf, image: Json) -> bytes | None:
-    """The bytes of an image inside the file, or in a file beside it; None where they are nowhere."""
+    """Return the bytes of an image inside the file, or in a file beside it; None where they are nowhere."""
     content = _image_content(file, image)
     file.require_room(("image", id(image)), len(content or b""))
     return content

@@ -57,7 +57,7 @@ class NamedFiles:
         return read_bounded(path, limit=min(limit, left))
 
     def holds(self, name: str) -> bool:
-        """Whether a file of that name is there."""
+        """Return whether a file of that name is there."""
         return os.path.isfile(self.folder / name)  # Path's own raises on names that are too long
 
 
@@ -140,7 +140,7 @@ def _share(value: float) -> float:
 
 
 def library_text(materials: tuple[Material, ...], images: dict[str, str]) -> str:
-    """A library with these materials; ``images`` names the file of each texture by its material's name."""
+    """Return a library with these materials; ``images`` names the file of each texture by its material's name."""
     lines = []
     for material in materials:
         lines += [f"newmtl {material.name}", "Kd {:.6g} {:.6g} {:.6g}".format(*material.colour[:3])]
@@ -150,6 +150,6 @@ def library_text(materials: tuple[Material, ...], images: dict[str, str]) -> str
 
 
 def texture_beside(files: NamedFiles, name: str) -> Image | None:
-    """A texture that a mesh file names; None for no name, and where it is not to be had."""
+    """Return a texture that a mesh file names; None for no name, and where it is not to be had."""
     content = files.read(name, "texture") if name else None
     return Image(PurePosixPath(name).name, content) if content is not None else None

@@ -134,7 +134,7 @@ class ObjContent:
         return groups, False
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The text with other positions; normals follow them, edges that were sharp stay so."""
+        """Return the text with other positions; normals follow them, edges that were sharp stay so."""
         lines: list[bytes | None] = list(self._lines)
         for number, line in zip(self._at[b"v"], self._position_lines(vertices), strict=True):
             lines[number] = line
@@ -176,7 +176,7 @@ class ObjContent:
         lines[self._at[b"vn"][0]] = block + self._end
 
     def companions(self) -> Encoded:
-        """The material libraries and their textures."""
+        """Return the material libraries and their textures."""
         return Encoded(b"", self._libraries.beside, self._libraries.missing)
 
     @cached_property

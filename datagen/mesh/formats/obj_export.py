@@ -15,7 +15,7 @@ _SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg"}
 
 
 def built_obj(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str | None) -> Encoded:
-    """An OBJ file, with ``stem``.mtl and textures named after it; without them where ``stem`` is None."""
+    """Return an OBJ file, with ``stem``.mtl and textures named after it; without them where ``stem`` is None."""
     materials = _told_apart(surface.materials) if stem else ()
     images = _images(materials, stem) if stem else {}
     lines = [f"mtllib {stem}.mtl"] if materials else []

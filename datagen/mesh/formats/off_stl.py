@@ -73,7 +73,7 @@ class OffContent(Alone):
         return Surface(*self._faces, shading=self._faces[0] if self._has_normals else None, colours=_colours(colours))
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The same text with other positions, and normals that follow them."""
+        """Return the same text with other positions, and normals that follow them."""
         columns = vertices
         if self._has_normals:
             normals = shared_normals(vertices, self.surface, self.surface.corners, count=len(vertices))
@@ -143,7 +143,7 @@ class StlContent(Alone):
         return Surface(self._corners, np.full(len(self._corners) // 3, 3, np.int64))
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The same triangles elsewhere, in text where the file was text."""
+        """Return the same triangles elsewhere, in text where the file was text."""
         at = vertices[self._corners].reshape(-1, 3, 3)
         if not self._binary:
             return Encoded(_stl_text(at, self.name or ""))

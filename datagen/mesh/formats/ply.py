@@ -95,7 +95,7 @@ class PlyContent:
         return list(dict.fromkeys(left))
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The same file with other positions, and normals that follow them."""
+        """Return the same file with other positions, and normals that follow them."""
         columns = {axis: vertices[:, number] for number, axis in enumerate("xyz")}
         if self._group is not None:
             surface = self.surface
@@ -123,7 +123,7 @@ class PlyContent:
         return self._content[: self._header.end] + b"\n".join(rows) + b"\n"
 
     def companions(self) -> Encoded:
-        """The texture that a comment names (``TextureFile``, as MeshLab writes it)."""
+        """Return the texture that a comment names (``TextureFile``, as MeshLab writes it)."""
         texture_beside(self._files, self._texture_name)
         return Encoded(b"", self._files.contents, list(dict.fromkeys(self._files.missing)))
 

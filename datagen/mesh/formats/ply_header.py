@@ -45,12 +45,12 @@ class Header:
     end: int
 
     def count(self, name: str) -> int:
-        """How many elements of a name there are."""
+        """Return how many elements of a name there are."""
         return sum(element.count for element in self.elements if element.name == name)
 
 
 def read_header(content: bytes) -> Header:
-    """The header at the beginning of a file; ValueError where there is none."""
+    """Return the header at the beginning of a file; ValueError where there is none."""
     end = content[:_HEADER].find(b"end_header")
     if not content.startswith(b"ply") or end < 0:
         raise ValueError("it does not begin with a PLY header")
@@ -95,7 +95,7 @@ class Table:
 
 
 def read_tables(content: bytes, header: Header, rows: list[bytes]) -> dict[str, Table]:
-    """The table of each element; ``rows`` are the lines of a text that follow its header."""
+    """Return the table of each element; ``rows`` are the lines of a text that follow its header."""
     tables: dict[str, Table] = {}
     at = 0 if rows else header.end
     for element in header.elements:

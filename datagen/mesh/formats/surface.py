@@ -112,7 +112,7 @@ class Content(Protocol):
     def only_here(self) -> list[str]: ...
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """The same file with other positions [n, 3]."""
+        """Return the same file with other positions [n, 3]."""
 
     def companions(self) -> Encoded:
         """Files that this one names, to be copied along (``content`` is empty)."""
@@ -154,7 +154,7 @@ def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, str |
 def shared_normals(
     vertices: NDArray[np.float64], surface: Surface, shading: NDArray[np.int64], *, count: int = 0
 ) -> NDArray[np.float64]:
-    """Unit normals [group, 3] of groups of corners: the mean of their polygons' normals, weighted by area.
+    """Return unit normals [group, 3] of groups of corners: the mean of their polygons' normals, weighted by area.
 
     ``vertices`` [n, 3]; ``shading`` [corner] as in :class:`Surface`, -1 for corners without a normal; ``count``: groups
     at least. A group without area gets +Y.
@@ -184,7 +184,7 @@ def numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
-    """The numbers [word] that words of a text stand for; ValueError where one stands for none.
+    """Return the numbers [word] that words of a text stand for; ValueError where one stands for none.
 
     An array of the words themselves would be as wide as the longest of them.
     """
@@ -195,7 +195,7 @@ def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
 
 
 def numbers_in(text: bytes, kind: type[np.generic] = np.float64) -> NDArray[Any]:
-    """The numbers of a text, which white space parts; ValueError where anything else is in it."""
+    """Return the numbers of a text, which white space parts; ValueError where anything else is in it."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy only warns where it stops at what is no number
         try:
@@ -205,7 +205,7 @@ def numbers_in(text: bytes, kind: type[np.generic] = np.float64) -> NDArray[Any]
 
 
 def one_word(name: str) -> str:
-    """A name as OBJ and MTL files can hold it: without spaces, and not empty."""
+    """Return a name as OBJ and MTL files can hold it: without spaces, and not empty."""
     return re.sub(r"\s+", "_", name.strip()) or "mesh"
 
 

@@ -140,7 +140,7 @@ def test_what_cannot_be_an_animation_leaves_nothing(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(mesh_glb_written, "FRAME_LIMIT", 2)
     with pytest.raises(MeshError, match="more than 2 frames"):
         write_animation(read, frames, out, frames_per_second=10)
-    monkeypatch.setattr(mesh_glb_written, "LARGEST", 100)
+    monkeypatch.setattr(mesh_glb_written, "GLB_LIMIT", 100)
     with pytest.raises(MeshError, match="4 GiB"):
         write_animation(read, frames[:2], out, frames_per_second=10)
     assert not list((tmp_path / "out").iterdir())

@@ -37,7 +37,7 @@ def told(
     seen: Seen | None = SEEN,
 ) -> str:
     both = UPRIGHT, way.axes
-    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, both=both, told=by_hand, seen=seen))
+    return "\n".join(remarks(mesh, name="A", axes=axes, way=way, both=both, stated=by_hand, seen=seen))
 
 
 @pytest.mark.parametrize("seen", [SEEN, None])
