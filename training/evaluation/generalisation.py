@@ -7,7 +7,6 @@ picture is then all that can be shown.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from datagen.common.errors import DatasetError
 from datagen.store import Dataset
 from training.evaluation.document import Table
 from training.evaluation.measure import POSE_TYPES, LoadedMethod, normalised, transfer_each
-from training.evaluation.results import Score, Triple, kept_rows, write_csv
+from training.evaluation.results import Score, Triple
 from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of
 from training.evaluation.statistics import mean
 
@@ -177,13 +176,3 @@ def grid_table(
 
 def _cell(value: float, factor: float) -> str:
     return f"{value * factor:.1f}" if np.isfinite(value) else "–"
-
-
-def write_rows(rows: Sequence[GeneralisationRow], path: Path) -> None:
-    """Write rows as CSV."""
-    write_csv(rows, path, GeneralisationRow)
-
-
-def read_rows(path: Path) -> list[GeneralisationRow]:
-    """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return kept_rows(path, GeneralisationRow)

@@ -7,7 +7,6 @@ they are. The no-op ``target unchanged`` says what doing nothing would score, wh
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +18,7 @@ from datagen.store import Dataset
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.document import Table
 from training.evaluation.measure import NO_OPS, POSE_TYPES, LoadedMethod, normalised, score, transfer_each
-from training.evaluation.results import Score, Triple, kept_rows, write_csv
+from training.evaluation.results import Score, Triple
 from training.evaluation.statistics import mean, mean_and_interval
 
 NO_OP = NO_OPS[0]
@@ -175,16 +174,6 @@ def _rows(
 def methods_in(rows: Sequence[_OfMethod]) -> list[str]:
     """Trained methods in the order of the rows."""
     return [name for name in dict.fromkeys(row.method for row in rows) if name != NO_OP]
-
-
-def write_rows(rows: Sequence[RobustnessRow], path: Path) -> None:
-    """Write rows as CSV."""
-    write_csv(rows, path, RobustnessRow)
-
-
-def read_rows(path: Path) -> list[RobustnessRow]:
-    """Rows of a CSV that :func:`write_rows` wrote; none where there is no file."""
-    return kept_rows(path, RobustnessRow)
 
 
 @dataclass(frozen=True)

@@ -6,22 +6,26 @@ Results are files in one folder; a record beside them lets ``dsffnet sync FOLDER
 import argparse
 import json
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 from datagen.common.errors import RecipeError, UnsafeFileError
 from datagen.common.files import read_within, write_atomically
 from datagen.common.printable import printable
 from training.evaluation.evaluate import fingerprint_of
 from training.evaluation.measure import LoadedMethod, load_methods
+from training.evaluation.results import RowType, kept_rows, write_csv
 from training.tracking.record import read_record, update_record
+from workflows.pipeline.console import print_text
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.weights_argument import Evaluated, evaluated
 
 _SETTINGS = "settings.json"
+_SAVE_EVERY = 5.0  # seconds
 
 
 def weights_of(options: argparse.Namespace) -> list[Evaluated]:
@@ -85,11 +89,6 @@ def about_weights(weights: Sequence[Evaluated]) -> list[str]:
     return [f"step {its.checkpoint.step} {fingerprint_of(its.checkpoint)}" for its in weights]
 
 
-def sync_words(folder: Path) -> str:
-    """The command that sends a study to MLflow."""
-    return f"dsffnet sync {shlex.quote(str(folder))}"
-
-
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
     """Whether a folder's rows were measured with these settings; from now on the folder's rows are."""
     text = json.dumps(settings, indent=1, sort_keys=True).encode()
@@ -103,12 +102,80 @@ def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
     return same
 
 
-@contextmanager
-def study(
-    folder: Path, name: str, weights: Sequence[Evaluated], settings: dict[str, Any], artifacts: Sequence[str]
-) -> Iterator[dict[str, float]]:
-    """Record a study while the block runs; the block fills the dictionary with the metrics to show."""
-    metrics: dict[str, float] = {}
-    with recorded(folder, kind="evaluate", name=name, parent=parent_of(weights), parameters=settings):
-        yield metrics
-        update_record(folder, artifacts=[its for its in artifacts if (folder / its).exists()], metrics=metrics)
+class Study(ABC, Generic[RowType]):
+    """A study, planned: what is measured on which weights, and what is made of the rows.
+
+    Attributes
+    ----------
+    name
+        Of its record, and of its text (NAME.md).
+    row
+        The dataclass of its rows.
+    pictures
+        Files that :meth:`draw` leaves.
+    folder, weights
+        Where results go, and of which weights they are.
+    settings
+        What rows depend on, as plain data: rows of other settings are measured again.
+    """
+
+    name: str
+    row: type[RowType]
+    pictures: tuple[str, ...]
+    folder: Path
+    weights: Sequence[Evaluated]
+    settings: dict[str, Any]
+
+    @abstractmethod
+    def measure(self, done: list[RowType]) -> Iterable[list[RowType]]:
+        """Rows that ``done`` lacks, in batches, with a bar."""
+
+    @abstractmethod
+    def draw(self, rows: list[RowType]) -> None:
+        """Draw the pictures into the folder."""
+
+    @abstractmethod
+    def report(self, rows: list[RowType]) -> str:
+        """The study as Markdown."""
+
+    @abstractmethod
+    def metrics(self, rows: list[RowType]) -> dict[str, float]:
+        """What MLflow shows."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """What the study leaves in its folder."""
+        return (f"{self.name}.md", "rows.csv", *self.pictures)
+
+
+def run_study(study: Study[RowType]) -> None:
+    """Measure what is missing, draw, write and print the report, and record it for MLflow."""
+    folder, parent = study.folder, parent_of(study.weights)
+    with recorded(folder, kind="evaluate", name=study.name, parent=parent, parameters=study.settings):
+        rows = _measured(study)
+        study.draw(rows)
+        text = study.report(rows)
+        write_atomically(folder / f"{study.name}.md", text.encode())
+        artifacts = [name for name in study.files if (folder / name).exists()]
+        update_record(folder, artifacts=artifacts, metrics=study.metrics(rows))
+    sync = f"dsffnet sync {shlex.quote(str(folder))}"
+    print_text(f"{text}\npictures, rows, this text: {folder} ({', '.join(study.files)}). To MLflow: {sync}")
+
+
+def _measured(study: Study[RowType]) -> list[RowType]:
+    """All rows of the folder: those that were there with these settings, and what is missing."""
+    path = study.folder / "rows.csv"
+    same_settings(study.folder, study.settings)
+    rows, saved = kept_rows(path, study.row), time.monotonic()
+    for some in study.measure(list(rows)):
+        rows += some
+        if time.monotonic() > saved + _SAVE_EVERY:  # a run that is stopped resumes from here
+            write_csv(rows, path, study.row)
+            saved = time.monotonic()
+    write_csv(rows, path, study.row)
+    return rows
+
+
+def metric_name(method: str) -> str:
+    """A method's name as part of the name of a metric in MLflow."""
+    return method.replace(" ", "_").translate(str.maketrans("", "", "()"))

@@ -1,12 +1,9 @@
 """Generalisation as a command: its files, what it prints."""
 
 import argparse
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 from datagen.common.errors import RecipeError
-from datagen.common.files import write_atomically
 from datagen.recipe import DatasetRecipe
 from datagen.recipe.base import LARGEST
 from training.evaluation.document import Table, Text, document_markdown, plain
@@ -18,63 +15,104 @@ from training.evaluation.generalisation import (
     have_truth,
     measured,
     pairs_with_truth,
-    read_rows,
-    write_rows,
 )
-from training.evaluation.measure import LoadedMethod
-from training.evaluation.robustness import Case, methods_in
+from training.evaluation.robustness import NO_OP, Case, methods_in
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
-from workflows.pipeline.console import print_text
 from workflows.pipeline.progress import bar
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.stage import say
 from workflows.pipeline.weights_argument import Evaluated
 from workflows.recipe.loader import load_recipe
 from workflows.studies.common import (
+    Study,
     about_weights,
     folder_of,
     methods_of,
-    same_settings,
-    study,
-    sync_words,
+    metric_name,
+    run_study,
     weights_of,
 )
 from workflows.studies.mesh_kinds import imported_kind, make_kinds, own_kind, own_recipe
 from workflows.studies.sizes import Sizes
 
-_FILES = ("generalisation.md", "rows.csv", "heat-map.png", "examples.png")
 _FIRST_RECIPE = "quickstart"
 
 
 def generalisation_command(options: argparse.Namespace) -> None:
     """Transfer between bodies and vertex counts that the weights were not trained on, and measure it."""
-    sizes = _sizes(options)
-    weights = weights_of(options)
-    base, methods = _base(options, weights), methods_of(weights)
-    folder = folder_of(options, weights, "generalisation")
-    extra = [imported_kind(require_reachable(url, option="--data", urls=True)) for url in options.data]
-    kinds = make_kinds(base, options.topologies, options.others, folder / "data", sizes, say=say) + extra
-    _require_names(kinds)
-    settings = {
-        "weights": about_weights(weights),
-        "methods": [method.name for method in methods],
-        "kinds": {kind.name: kind.dataset.uuid for kind in kinds},
-        "triples": sizes.triples,
-    }
-    with study(folder, "generalisation", weights, settings, _FILES) as metrics:
-        rows = _measured(folder, settings, methods, kinds, sizes)
-        names, trained = [kind.name for kind in kinds], [_trained(its, kinds) for its in weights]
-        title = f"PMD (1e-4), {sizes.triples} transfers a cell; frame: as trained; last line: the target unchanged"
-        heat_map(rows, names, folder / "heat-map.png", title=title, trained=trained)
-        shown = examples(kinds, trained[0] or names[0])
+    run_study(GeneralisationStudy(options))
+
+
+class GeneralisationStudy(Study[GeneralisationRow]):
+    """Weights on transfers between kinds of meshes, whose datasets are made below the study's folder.
+
+    Raises
+    ------
+    RecipeError
+        An option is invalid, two kinds have one name, or the folder holds other work.
+    CheckpointError, DatasetError
+        Weights or evaluation triples are missing.
+    """
+
+    name, row = "generalisation", GeneralisationRow
+    pictures = ("heat-map.png", "examples.png")
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.sizes = sizes = _sizes(options)
+        self.weights = weights_of(options)
+        base, self.methods = _base(options, self.weights), methods_of(self.weights)
+        self.folder = folder_of(options, self.weights, self.name)
+        extra = [imported_kind(require_reachable(url, option="--data", urls=True)) for url in options.data]
+        made = make_kinds(base, options.topologies, options.others, self.folder / "data", sizes, say=say)
+        self.kinds = _named_apart([*made, *extra])
+        self.names = [kind.name for kind in self.kinds]
+        self.trained = [_trained(its, self.kinds) for its in self.weights]
+        self.settings = {
+            "weights": about_weights(self.weights),
+            "methods": [method.name for method in self.methods],
+            "kinds": {kind.name: kind.dataset.uuid for kind in self.kinds},
+            "triples": sizes.triples,
+        }
+
+    def measure(self, done: list[GeneralisationRow]) -> Iterable[list[GeneralisationRow]]:
+        found = measured(self.methods, self.kinds, triples=self.sizes.triples, done=done)
+        return bar(found, total=len(pairs_with_truth(self.kinds)), what="generalise", unit="pair")
+
+    def draw(self, rows: list[GeneralisationRow]) -> None:
+        title = f"PMD (1e-4), {self.sizes.triples} transfers a cell; frame: as trained; last line: the target unchanged"
+        heat_map(rows, self.names, self.folder / "heat-map.png", title=title, trained=self.trained)
+        shown = examples(self.kinds, self.trained[0] or self.names[0])
         title = "Transfers between kinds of meshes: the first of each pair's list, not chosen by result"
-        generalisation_picture(shown, methods, folder / "examples.png", title=title)
-        text = report(rows, methods, kinds, sizes, trained)
-        write_atomically(folder / "generalisation.md", text.encode())
-        metrics.update(_metrics(rows, names))
-    print_text(
-        f"{text}\npictures, rows, data, this text: {folder} ({', '.join(_FILES)}). To MLflow: {sync_words(folder)}"
-    )
+        generalisation_picture(shown, self.methods, self.folder / "examples.png", title=title)
+
+    def metrics(self, rows: list[GeneralisationRow]) -> dict[str, float]:
+        """PMD (1e-4) of each method over all pairs between kinds, and within them."""
+        values: dict[str, list[float]] = {}
+        for row in rows:
+            if row.method != NO_OP:
+                where = "within" if row.source_kind == row.target_kind else "between"
+                values.setdefault(f"pmd/{where}/{metric_name(row.method)}", []).append(row.pmd * 1e4)
+        return {name: sum(its) / len(its) for name, its in values.items()}
+
+    def report(self, rows: list[GeneralisationRow]) -> str:
+        """What was done, and a grid of each method."""
+        sizes = self.sizes
+        whose = "; ".join(
+            f"{plain(method.name)}: step {method.step:,}, trained on {plain(own) or 'none of these kinds'}"
+            for method, own in zip(self.methods, self.trained, strict=True)
+        )
+        about = (
+            f"Weights: {whose}. {sizes.identities} new identities in "
+            f"{sizes.poses} new poses of each kind, {sizes.triples} transfers a pair (a dataset of your own: its own "
+            "triples). All Anny kinds are the same people; the stand-in in SMPL's format has people of its own in the "
+            "same poses; animals have poses of their own, so that between them and people there is no ground truth. "
+            "PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box; mm: mean distance of "
+            "a vertex. Pairs down to across: source to target; –: no ground truth is known, or the network takes "
+            "no other vertex count."
+        )
+        pictures = Text("![heat map](heat-map.png)\n\n![examples](examples.png)")
+        grids = [part for name in methods_in(rows) for part in _grids(rows, self.names, name)]
+        return document_markdown("Generalisation to other bodies and vertex counts", (Text(about), pictures, *grids))
 
 
 def _sizes(options: argparse.Namespace) -> Sizes:
@@ -97,30 +135,18 @@ def _base(options: argparse.Namespace, weights: Sequence[Evaluated]) -> DatasetR
     return own or load_recipe(_FIRST_RECIPE).data
 
 
-def _require_names(kinds: Sequence[Kind]) -> None:
+def _named_apart(kinds: Sequence[Kind]) -> Sequence[Kind]:
     names = [kind.name for kind in kinds]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise RecipeError(f"two datasets would both be called {twice[0]!r}. Name each once, or rename a folder")
+    return kinds
 
 
 def _trained(weights: Evaluated, kinds: Sequence[Kind]) -> str:
     """The kind that weights were trained on, empty where it is none of these or not known."""
     own = own_recipe(weights.home)
     return own_kind(own, kinds) if own else ""
-
-
-def _measured(
-    folder: Path, settings: dict[str, Any], methods: Sequence[LoadedMethod], kinds: Sequence[Kind], sizes: Sizes
-) -> list[GeneralisationRow]:
-    same_settings(folder, settings)
-    rows = read_rows(folder / "rows.csv")
-    found = measured(methods, kinds, triples=sizes.triples, done=rows)
-    for some in bar(found, total=len(pairs_with_truth(kinds)), what="generalise", unit="pair"):
-        if some:
-            rows += some
-            write_rows(rows, folder / "rows.csv")
-    return rows
 
 
 def examples(kinds: Sequence[Kind], trained: str) -> list[Shown]:
@@ -147,48 +173,6 @@ def _shown(source: Kind, target: Kind) -> Shown:
 
 def _in_lines(name: str) -> str:
     return name if len(name) < 13 else "\n".join(name.rsplit(" ", 1))
-
-
-def _metrics(rows: Sequence[GeneralisationRow], names: Sequence[str]) -> dict[str, float]:
-    """PMD (1e-4) of each method over all pairs between kinds, and within them."""
-    found = {}
-    for method in methods_in(rows):
-        values: dict[bool, list[float]] = {True: [], False: []}
-        for row in rows:
-            if row.method == method:
-                values[row.source_kind == row.target_kind].append(row.pmd * 1e4)
-        name = method.replace(" ", "_").translate(str.maketrans("", "", "()"))
-        for within, its in values.items():
-            if its:
-                found[f"pmd/{'within' if within else 'between'}/{name}"] = sum(its) / len(its)
-    return found
-
-
-def report(
-    rows: Sequence[GeneralisationRow],
-    methods: Sequence[LoadedMethod],
-    kinds: Sequence[Kind],
-    sizes: Sizes,
-    trained: Sequence[str],
-) -> str:
-    """The study as Markdown."""
-    names = [kind.name for kind in kinds]
-    whose = "; ".join(
-        f"{plain(method.name)}: step {method.step:,}, trained on {plain(own) or 'none of these kinds'}"
-        for method, own in zip(methods, trained, strict=True)
-    )
-    grids = [part for name in methods_in(rows) for part in _grids(rows, names, name)]
-    about = (
-        f"Weights: {whose}. {sizes.identities} new identities in "
-        f"{sizes.poses} new poses of each kind, {sizes.triples} transfers a pair (a dataset of your own: its own "
-        "triples). All Anny kinds are the same people; the stand-in in SMPL's format has people of its own in the same "
-        "poses; animals have poses of their own, so that between them and people there is no ground truth. PMD: mean "
-        "over vertices and coordinates of (output - truth)^2 in the normalised box; mm: mean distance of a vertex. "
-        "Pairs down to across: source to target; –: no ground truth is known, or the network takes "
-        "no other vertex count."
-    )
-    pictures = Text("![heat map](heat-map.png)\n\n![examples](examples.png)")
-    return document_markdown("Generalisation to other bodies and vertex counts", (Text(about), pictures, *grids))
 
 
 def _grids(rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str) -> list[Text | Table]:

@@ -1,17 +1,16 @@
 """Robustness as a command: its files, what it prints."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from datagen.common.errors import RecipeError
-from datagen.common.files import write_atomically
 from datagen.store import open_dataset
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.document import Text, document_markdown, plain
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.robustness import (
+    NO_OP,
     Case,
     RobustnessRow,
     amounts_table,
@@ -20,10 +19,8 @@ from training.evaluation.robustness import (
     limits_table,
     measured,
     no_op,
-    read_rows,
     refusal,
     steps,
-    write_rows,
 )
 from training.reports.plots.robustness import (
     disturbance_picture,
@@ -32,46 +29,97 @@ from training.reports.plots.robustness import (
     one_of_each,
     robustness_curves,
 )
-from workflows.pipeline.console import print_text
 from workflows.pipeline.progress import bar
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.studies.common import (
+    Study,
     about_weights,
     folder_of,
     methods_of,
-    same_settings,
-    study,
-    sync_words,
+    metric_name,
+    run_study,
     weights_of,
 )
 
-_FILES = ("robustness.md", "rows.csv", "curves.png", "noise.png", "disturbances.png")
 _KNOWN = tuple(its.name for its in DISTURBANCES)
 
 
 def robustness_command(options: argparse.Namespace) -> None:
     """Disturb the source (noise, missing parts, other sampling, rotation) and measure what comes out."""
-    disturbances = _asked(options)
-    weights, data = weights_of(options), require_reachable(options.data, option="--data", urls=True)
-    dataset, methods = open_dataset(data), methods_of(weights)
-    cases = cases_of(dataset, options.triples)
-    _require_example(options, cases)
-    folder = folder_of(options, weights, "robustness")
-    settings = {
-        "weights": about_weights(weights),
-        "methods": [method.name for method in methods],
-        "dataset": dataset.uuid,
-        "triples": len(cases),
-        "emd_points": options.emd_points,
-        "amounts": {its.name: list(its.amounts) for its in DISTURBANCES},
-    }
-    with study(folder, "robustness", weights, settings, _FILES) as metrics:
-        rows = _measured(folder, settings, methods, cases, disturbances, options)
-        metrics.update(_metrics(rows, methods))
-        _draw(folder, rows, methods, cases[options.example])
-        text = report(rows, methods, disturbances, data=Path(data).name, cases=len(cases))
-        write_atomically(folder / "robustness.md", text.encode())
-    print_text(f"{text}\npictures, rows, this text: {folder} ({', '.join(_FILES)}). To MLflow: {sync_words(folder)}")
+    run_study(RobustnessStudy(options))
+
+
+class RobustnessStudy(Study[RobustnessRow]):
+    """Weights on a dataset's first evaluation triples, whose sources are disturbed.
+
+    Raises
+    ------
+    RecipeError
+        An option is invalid, or the folder holds other work.
+    CheckpointError, DatasetError
+        Weights or evaluation triples are missing.
+    """
+
+    name, row = "robustness", RobustnessRow
+    pictures = ("curves.png", "noise.png", "disturbances.png")
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.disturbances = _asked(options)
+        self.weights, data = weights_of(options), require_reachable(options.data, option="--data", urls=True)
+        dataset, self.methods, self.data = open_dataset(data), methods_of(self.weights), Path(data).name
+        self.cases, self.emd_points = cases_of(dataset, options.triples), options.emd_points or None
+        self.example = _example(options, self.cases)
+        self.folder = folder_of(options, self.weights, self.name)
+        self.settings = {
+            "weights": about_weights(self.weights),
+            "methods": [method.name for method in self.methods],
+            "dataset": dataset.uuid,
+            "triples": len(self.cases),
+            "emd_points": options.emd_points,
+            "amounts": {its.name: list(its.amounts) for its in DISTURBANCES},
+        }
+
+    def measure(self, done: list[RobustnessRow]) -> Iterable[list[RobustnessRow]]:
+        there = {row.key for row in done}
+        asked = [(its[1].name, its[0].name, its[2]) for its in steps(self.methods, self.disturbances)]
+        missing = sum(key not in there for key in [(NO_OP, "", 0.0), *asked])
+        found = measured(self.methods, self.cases, self.disturbances, emd_points=self.emd_points, done=done)
+        return bar(found, total=missing, what="robustness", unit="amount")
+
+    def draw(self, rows: list[RobustnessRow]) -> None:
+        title = f"A disturbed source: PMD over {len({row.triple for row in rows})} triples"
+        robustness_curves(rows, self.folder / "curves.png", title=title)
+        who = "to identity {2} from identity {0}, pose {1}".format(*self.example.triple)
+        for name, chosen, what in (
+            ("noise.png", noise_levels(), "Noise on the source, standard deviation in half the longest box edge"),
+            ("disturbances.png", one_of_each(), "Other disturbances of the source"),
+        ):
+            disturbance_picture(self.example, self.methods, chosen, self.folder / name, title=f"{what} ({who})")
+
+    def metrics(self, rows: list[RobustnessRow]) -> dict[str, float]:
+        """PMD (1e-4) at the most of each disturbance: ``pmd/NOISE/METHOD``."""
+        curves = {
+            f"pmd/{its.name}/{metric_name(method.name)}": curve(rows, method.name, its.name)
+            for method in self.methods
+            for its in DISTURBANCES
+        }
+        return {name: levels[-1].mean * 1e4 for name, levels in curves.items() if levels}
+
+    def report(self, rows: list[RobustnessRow]) -> str:
+        """What was done, where it breaks, every number."""
+        start = ", ".join(f"{plain(its.name)} {_undisturbed(rows, its):.2f}" for its in self.methods)
+        trained = "; ".join(f"{plain(method.name)}: step {method.step:,}" for method in self.methods)
+        about = (
+            f"Weights: {trained}. Dataset {plain(self.data)}, its first {len(self.cases)} "
+            "evaluation triples of new identities. Only the source is changed, before its normalisation; ground truth "
+            "and target stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, "
+            f"times 1e4. Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
+            f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m."
+        )
+        left_out = Text("".join(_left_out(method, self.disturbances) for method in self.methods))
+        pictures = Text("\n\n".join(f"![{Path(name).stem}]({name})" for name in self.pictures))
+        parts = (Text(about), limits_table(rows), left_out, pictures, amounts_table(rows))
+        return document_markdown("Robustness to a disturbed source", parts)
 
 
 def _asked(options: argparse.Namespace) -> list[Disturbance]:
@@ -83,76 +131,10 @@ def _asked(options: argparse.Namespace) -> list[Disturbance]:
     return [its for its in DISTURBANCES if not options.only or its.name in options.only]
 
 
-def _require_example(options: argparse.Namespace, cases: Sequence[Case]) -> None:
+def _example(options: argparse.Namespace, cases: Sequence[Case]) -> Case:
     if not 0 <= options.example < len(cases):
         raise RecipeError(f"--example {options.example}: there are the triples 0 to {len(cases) - 1}")
-
-
-def _measured(
-    folder: Path,
-    settings: dict[str, Any],
-    methods: Sequence[LoadedMethod],
-    cases: Sequence[Case],
-    disturbances: Sequence[Disturbance],
-    options: argparse.Namespace,
-) -> list[RobustnessRow]:
-    """All rows of the folder: those that were there with these settings, and what is missing of the disturbances."""
-    same_settings(folder, settings)
-    rows = read_rows(folder / "rows.csv")
-    there = {row.key for row in rows}
-    missing = [its for its in steps(methods, disturbances) if (its[1].name, its[0].name, its[2]) not in there]
-    found = measured(methods, cases, disturbances, emd_points=options.emd_points or None, done=rows)
-    for number, some in enumerate(bar(found, total=len(missing) + (not rows), what="robustness", unit="amount")):
-        rows += some
-        if number % 20 == 19:  # a run that is stopped goes on from here
-            write_rows(rows, folder / "rows.csv")
-    write_rows(rows, folder / "rows.csv")
-    return rows
-
-
-def _draw(folder: Path, rows: Sequence[RobustnessRow], methods: Sequence[LoadedMethod], case: Case) -> None:
-    robustness_curves(rows, folder / "curves.png", title=f"A disturbed source: PMD over {_count(rows)} triples")
-    who = "to identity {2} from identity {0}, pose {1}".format(*case.triple)
-    title = f"Noise on the source, standard deviation in half the longest box edge ({who})"
-    disturbance_picture(case, methods, noise_levels(), folder / "noise.png", title=title)
-    title = f"Other disturbances of the source ({who})"
-    disturbance_picture(case, methods, one_of_each(), folder / "disturbances.png", title=title)
-
-
-def _metrics(rows: Sequence[RobustnessRow], methods: Sequence[LoadedMethod]) -> dict[str, float]:
-    """PMD (1e-4) at the most of each disturbance, as MLflow shows it: ``pmd/NOISE/METHOD``."""
-    found = {}
-    for method in methods:
-        for disturbance in DISTURBANCES:
-            levels = curve(rows, method.name, disturbance.name)
-            if levels:
-                name = method.name.replace(" ", "_").translate(str.maketrans("", "", "()"))
-                found[f"pmd/{disturbance.name}/{name}"] = levels[-1].mean * 1e4
-    return found
-
-
-def report(
-    rows: Sequence[RobustnessRow],
-    methods: Sequence[LoadedMethod],
-    disturbances: Sequence[Disturbance],
-    *,
-    data: str,
-    cases: int,
-) -> str:
-    """The study as Markdown: what was done, where it breaks, every number."""
-    left_out = [_left_out(method, disturbances) for method in methods]
-    start = ", ".join(f"{plain(its.name)} {_undisturbed(rows, its):.2f}" for its in methods)
-    trained = "; ".join(f"{plain(method.name)}: step {method.step:,}" for method in methods)
-    about = (
-        f"Weights: {trained}. Dataset {plain(data)}, its first {cases} "
-        "evaluation triples of new identities. Only the source is changed, before its normalisation; ground truth and "
-        "target stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, times 1e4. "
-        f"Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
-        f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m."
-    )
-    pictures = Text("\n\n".join(f"![{name}]({name}.png)" for name in ("curves", "noise", "disturbances")))
-    parts = (Text(about), limits_table(rows), Text("".join(left_out)), pictures, amounts_table(rows))
-    return document_markdown("Robustness to a disturbed source", parts)
+    return cases[options.example]
 
 
 def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
@@ -165,7 +147,3 @@ def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
 def _undisturbed(rows: Sequence[RobustnessRow], method: LoadedMethod) -> float:
     levels = [curve(rows, method.name, its.name) for its in DISTURBANCES]
     return next(its[0].mean * 1e4 for its in levels if its)
-
-
-def _count(rows: Sequence[RobustnessRow]) -> int:
-    return len({row.triple for row in rows})

@@ -23,7 +23,7 @@ from training.checkpoints.folder import manifest_of, write_manifest
 from training.engine.launch import failure_of
 from training.engine.trainer import train
 from training.evaluation import generalisation, robustness
-from training.evaluation.results import read_rows
+from training.evaluation.results import kept_rows, read_rows
 from training.inference.domain_check import seen_by
 from training.inference.predict import load_trained
 from training.recipes.files import recipe_in
@@ -331,14 +331,14 @@ def test_a_file_that_only_claims_to_be_weights_is_one_line(tmp_path: Path, write
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("read", [robustness.read_rows, generalisation.read_rows])
+@pytest.mark.parametrize("row", [robustness.RobustnessRow, generalisation.GeneralisationRow])
 @pytest.mark.parametrize("content", ["a line", "no UTF-8", "a device", "a pipe", "a folder", "a link out"])
 def test_damaged_rows_of_an_earlier_start_are_set_aside(
-    tmp_path: Path, read: Any, content: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, row: Any, content: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "rows.csv"
     path.write_bytes(b"method,pmd\nDSFFNet,x\n")
     if content != "a line":
         put(path, content)
-    assert read(path) == [] and read(path) == []
+    assert kept_rows(path, row) == kept_rows(path, row) == []
     assert [entry.name for entry in tmp_path.iterdir()] == ["rows.csv.unreadable"] and len(caplog.messages) == 1

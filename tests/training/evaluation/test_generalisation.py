@@ -21,10 +21,9 @@ from training.evaluation.generalisation import (
     have_truth,
     measured,
     pairs_with_truth,
-    read_rows,
-    write_rows,
 )
 from training.evaluation.measure import LoadedMethod
+from training.evaluation.results import kept_rows, write_csv
 from training.networks import build_network
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 
@@ -94,9 +93,11 @@ def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[Kind], rows: li
 def test_what_is_there_is_not_measured_again(
     kinds: list[Kind], method: LoadedMethod, rows: list[GeneralisationRow], tmp_path: Path
 ) -> None:
-    write_rows(rows, tmp_path / "rows.csv")
+    write_csv(rows, tmp_path / "rows.csv", GeneralisationRow)
     again = [
-        row for some in measured([method], kinds, triples=4, done=read_rows(tmp_path / "rows.csv")) for row in some
+        row
+        for some in measured([method], kinds, triples=4, done=kept_rows(tmp_path / "rows.csv", GeneralisationRow))
+        for row in some
     ]
     assert again == []
 

@@ -16,7 +16,7 @@ from tests.support.recipes import tiny_dataset
 from training.data.batch import read_batch
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, score
-from training.evaluation.results import METRICS
+from training.evaluation.results import METRICS, kept_rows, write_csv
 from training.evaluation.robustness import (
     NO_OP,
     Level,
@@ -28,8 +28,6 @@ from training.evaluation.robustness import (
     limits_table,
     measured,
     no_op,
-    read_rows,
-    write_rows,
 )
 from training.networks import build_network
 from training.objectives.metrics import point_mesh_distance
@@ -115,10 +113,10 @@ def test_a_dataset_without_triples_is_refused_with_what_to_do(tmp_path: Path) ->
 
 
 def test_rows_come_back_from_their_file(tmp_path: Path, rows: list[RobustnessRow]) -> None:
-    write_rows(rows, tmp_path / "rows.csv")
-    back = read_rows(tmp_path / "rows.csv")
+    write_csv(rows, tmp_path / "rows.csv", RobustnessRow)
+    back = kept_rows(tmp_path / "rows.csv", RobustnessRow)
     assert [replace(row, earth_mover=0) for row in back] == [replace(row, earth_mover=0) for row in rows]
-    assert np.isnan([row.earth_mover for row in back]).all() and read_rows(tmp_path / "none.csv") == []
+    assert np.isnan([row.earth_mover for row in back]).all() and kept_rows(tmp_path / "none.csv", RobustnessRow) == []
 
 
 def test_tables_say_where_the_error_has_doubled(rows: list[RobustnessRow]) -> None:

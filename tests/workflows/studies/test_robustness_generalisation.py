@@ -16,7 +16,8 @@ from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.engine.trainer import train
 from training.evaluation.generalisation import have_truth
-from training.evaluation.robustness import read_rows
+from training.evaluation.results import read_csv
+from training.evaluation.robustness import RobustnessRow
 from training.tracking.record import begin_record, read_record
 from workflows.cli.main import parsed
 from workflows.studies.common import about_weights, folder_of, weights_of
@@ -46,24 +47,39 @@ def test_robustness_writes_its_files_and_goes_on_from_them(
     record = read_record(out)
     assert record is not None and record.status == "FINISHED" and "pmd/noise/DSFFNet" in record.metrics
     assert all((out / name).stat().st_size for name in record.artifacts) and len(record.artifacts) == 5
-    monkeypatch.setattr("workflows.studies.robustness._draw", lambda *_: None)  # takes seconds, and is seen above
+    monkeypatch.setattr(
+        "workflows.studies.robustness.RobustnessStudy.draw", lambda *_: None
+    )  # takes seconds, and is seen above
     before = (out / "rows.csv").read_text()
     study("robustness", *words, "shift")
     assert (out / "rows.csv").read_text().startswith(before), "what was measured is kept, more is added"
-    assert {row.disturbance for row in read_rows(out / "rows.csv")} == {"", "noise", "shift"}
+    assert {row.disturbance for row in read_csv(out / "rows.csv", RobustnessRow)} == {"", "noise", "shift"}
     study("robustness", *words[:5], "--triples", "1", "--only", "shift")
-    assert {row.disturbance for row in read_rows(out / "rows.csv")} == {"", "shift"}, "others were of other triples"
+    assert {row.disturbance for row in read_csv(out / "rows.csv", RobustnessRow)} == {"", "shift"}, (
+        "others were of other triples"
+    )
 
 
 def test_two_runs_of_one_network_are_told_apart_by_their_folders(
     dataset: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(tiny_training(steps=4), data=dataset, run=tmp_path / "second")
-    monkeypatch.setattr("workflows.studies.robustness._draw", lambda *_: None)
+    monkeypatch.setattr("workflows.studies.robustness.RobustnessStudy.draw", lambda *_: None)
     out = tmp_path / "both"
-    runs = (str(run), str(tmp_path / "second"))
-    study("robustness", *runs, "--data", dataset, "--out", str(out), "--triples", "1", "--only", "scale")
-    names = {row.method for row in read_rows(out / "rows.csv")}
+    study(
+        "robustness",
+        str(run),
+        str(tmp_path / "second"),
+        "--data",
+        dataset,
+        "--out",
+        str(out),
+        "--triples",
+        "1",
+        "--only",
+        "scale",
+    )
+    names = {row.method for row in read_csv(out / "rows.csv", RobustnessRow)}
     assert names == {"target unchanged", f"DSFFNet {tmp_path.name}", "DSFFNet second"}
 
 

@@ -36,7 +36,7 @@ def style_learning(axes: Axes) -> None:
     """PMD on a logarithmic scale over steps or seconds from 0."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    logarithmic(axes.yaxis, range(1, 10) if high / low < 8 else (1, 2, 5) if high / low < 300 else (1,))
+    logarithmic(axes.yaxis, range(1, 10) if high / low < 8 else (1, 2, 5) if high / low < 1000 else (1,))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axes.set_xlim(left=0)
     axes.margins(x=0.01)
