@@ -35,10 +35,12 @@ def ours(weights: Path) -> Method:
     return Method("DSFFNet", str(weights))
 
 
-@pytest.fixture
-def run(dataset: str, tmp_path: Path) -> Path:
-    train(tiny_training(), data=dataset, run=tmp_path / "run")
-    return tmp_path / "run"
+@pytest.fixture(scope="module")
+def run(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of eight steps, read only."""
+    folder = tmp_path_factory.mktemp("run")
+    train(tiny_training(), data=str(_pristine), run=folder)
+    return folder
 
 
 def test_rows_are_those_of_the_fixed_list_and_no_ops_score_what_they_must(dataset: str, run: Path) -> None:
@@ -116,13 +118,12 @@ class Tasks:
             yield task(contenders, *rest)
 
 
-@pytest.fixture
-def other(dataset: str, tmp_path: Path) -> Path:
-    """A run of NPT."""
-    train(
-        tiny_training(network={"name": "npt", "encoder_widths": (8, 8, 13)}, steps=2), data=dataset, run=tmp_path / "n"
-    )
-    return tmp_path / "n"
+@pytest.fixture(scope="module")
+def other(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of NPT, read only."""
+    folder, network = tmp_path_factory.mktemp("other"), {"name": "npt", "encoder_widths": (8, 8, 13)}
+    train(tiny_training(network=network, steps=2), data=str(_pristine), run=folder)
+    return folder
 
 
 def test_all_methods_are_measured_on_the_same_triples_as_each_would_be_alone(

@@ -24,11 +24,12 @@ NETWORKS = {
 }
 
 
-@pytest.fixture
-def methods(dataset: str, tmp_path: Path) -> list[Method]:
+@pytest.fixture(scope="module")
+def methods(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Method]:
+    folder = tmp_path_factory.mktemp("runs")
     for name, network in NETWORKS.items():
-        train(tiny_training(network=network, steps=1), data=dataset, run=tmp_path / name)
-    return [Method(name, str(tmp_path / name)) for name in NETWORKS]
+        train(tiny_training(network=network, steps=1), data=str(_pristine), run=folder / name)
+    return [Method(name, str(folder / name)) for name in NETWORKS]
 
 
 def test_sizes_are_those_of_the_files_that_an_export_in_float32_writes(methods: list[Method], tmp_path: Path) -> None:
