@@ -24,11 +24,10 @@ from threadpoolctl import threadpool_limits
 from datagen.bodies import load_body
 from datagen.common.seeding import Stream, generator
 from datagen.generate import ensure_shard, generate, prepare
-from datagen.grid import Grid, Shard
+from datagen.grid import Shard
 from datagen.mesh.rig import part_transforms
 from datagen.poses import draw_poses
 from datagen.recipe import DatasetRecipe
-from datagen.store.schema import shard_path
 
 POSES, IDENTITIES, ROUNDS, ONE_AT_A_TIME = 100, 7, 7, 10
 
@@ -83,10 +82,10 @@ def rate(work: Callable[[], object], meshes: int) -> float:
 def measure(topology: str, folder: Path) -> None:
     """Measure and print one topology's table."""
     recipe, url = recipe_of(topology), str(folder / f"{topology}.zarr")
-    body, shards = load_body(recipe.body), Grid(recipe).shards()
+    body = load_body(recipe.body)
     parameters = body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, 0), 0)
     poses, faces = draw_poses(recipe.poses, range(POSES)), body.faces(parameters)
-    prepare(url, recipe)
+    shards = prepare(url, recipe).shards()
     forward = annys_own_forward(topology)
     todo = list(shards)
     names = {
@@ -129,7 +128,7 @@ def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) 
     for place in range(100):
         dataset.vertices(place % count, place * 37 % POSES)
     single = 100 / (time.perf_counter() - began)
-    stored = sum((Path(url) / shard_path(shard)).stat().st_size for shard in shards) / count / POSES
+    stored = sum((Path(url) / shard.path).stat().st_size for shard in shards) / count / POSES
     text = np.mean([path.stat().st_size for path in folder.glob("0_*.obj")])
     print(f"  reading: whole shards {whole:,.0f} MB/s, single meshes {single:,.0f}/s")
     print(f"  size: {stored / 1e3:.1f} kB a mesh, {stored / text:.3f} of its OBJ")
@@ -140,11 +139,9 @@ import sys, tempfile
 from benchmarks.generation import recipe_of
 from benchmarks.peak_memory import peak_mebibytes
 from datagen.generate import ensure_shard, prepare
-from datagen.grid import Grid
 recipe = recipe_of(sys.argv[1], identities=int(sys.argv[2]))
 with tempfile.TemporaryDirectory() as folder:
-    prepare(f"{folder}/x.zarr", recipe)
-    for shard in Grid(recipe).shards():
+    for shard in prepare(f"{folder}/x.zarr", recipe).shards():
         ensure_shard(f"{folder}/x.zarr", recipe, shard)
 print(peak_mebibytes())
 """
@@ -175,8 +172,7 @@ def scaling(topology: str, identities: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             for name, count in (("warm", 8), ("timed", identities)):
                 recipe, url = recipe_of(topology, count), f"{folder}/{name}.zarr"
-                prepare(url, recipe)
-                arguments = [(url, recipe, shard) for shard in Grid(recipe).shards()]
+                arguments = [(url, recipe, shard) for shard in prepare(url, recipe).shards()]
                 began = time.perf_counter()
                 meshes = sum(row.rows for row in ray_runner(ensure_shard, arguments))
             rates.append(meshes / (time.perf_counter() - began))

@@ -1,15 +1,17 @@
-"""Identities x poses -> splits -> rows -> shards -> evaluation triples. Pure; no input or output.
+"""Identities x poses -> splits -> arrays of vertices -> shards -> evaluation triples. Pure; no input or output.
 
 The grid of the DSFFNet paper (section 4.1): training identities are made in the seen poses only, evaluation
-identities in the seen and the unseen ones. A shard is a run of rows of one identity's array.
+identities in the seen and the unseen ones. The identities of a split that share a topology are one array of vertices
+[identity, pose, vertex, 3]; a shard is a block of some identities in some poses of it.
 
-A grid grows in steps: what a step appends is numbered after everything before it, and its poses begin at a new shard,
-so that no shard that exists is ever written again. Rows between a step's last pose and the next shard are holes.
+A grid grows in steps: what a step appends is numbered after everything before it, and its identities and poses begin at
+new shards, so that no shard that exists is ever written again. Places up to the next shard are holes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -23,21 +25,46 @@ Split = Literal["training", "evaluation"]
 POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 SPLITS: tuple[Split, ...] = ("training", "evaluation")
 HOLE = -1
-"""The pose number of a row that holds no mesh."""
+"""The number at a place along the identities or poses of an array that holds no mesh."""
+LARGEST_SHARD = 2**26
+"""Bytes of the vertices of a shard, unless a single mesh has more."""
+Place = tuple[int, int, int, int]
+"""Of a shard: number of its split, topology, place along the identities and along the poses, counted in shards."""
 
 
-@dataclass(frozen=True, order=True)
+def shard_path(place: Place) -> str:
+    """Path of a shard's object within a dataset."""
+    split, topology, row, column = place
+    return f"grid/{SPLITS[split]}/{topology}/vertices/c/{row}/{column}/0/0"
+
+
+@dataclass(frozen=True)
 class Shard:
-    """Rows ``[start, stop)`` of one identity's array; ``number`` is its place along the row axis."""
+    """A block of an array of vertices: each of ``identities`` in each of ``poses``, both by number.
 
-    identity: int
-    number: int
-    start: int
-    stop: int
+    Attributes
+    ----------
+    vertices
+        Of each mesh.
+    room
+        How many identities and poses a full shard of the array has.
+    """
+
+    place: Place
+    identities: tuple[int, ...]
+    poses: range
+    vertices: int
+    room: tuple[int, int]
+
+    @property
+    def path(self) -> str:
+        """Path of its object within a dataset."""
+        return shard_path(self.place)
 
     @property
     def rows(self) -> int:
-        return self.stop - self.start
+        """How many meshes it holds."""
+        return len(self.identities) * len(self.poses)
 
 
 @dataclass(frozen=True)
@@ -99,61 +126,54 @@ class Grid:
         return np.flatnonzero([its == pose_type for its in self._pose_types])
 
     def poses_of(self, identity: int) -> NDArray[np.int64]:
-        """Pose numbers that this identity is made in, in the order of its rows."""
-        rows = self.rows_of(identity)
-        return rows[rows != HOLE]
-
-    def rows_of(self, identity: int) -> NDArray[np.int64]:
-        """The pose number of each row [row] of an identity's array; ``HOLE`` where a row holds no mesh."""
-        return self._rows[self.split(identity)]
-
-    def row_of(self, identity: int, pose: int) -> int:
-        """The row that holds a pose of an identity (KeyError where there is none)."""
-        return self._row_numbers[self.split(identity)][pose]
+        """Pose numbers that this identity is made in, ascending."""
+        return self._poses_in[self.split(identity)]
 
     @cached_property
-    def _row_numbers(self) -> dict[Split, dict[int, int]]:
-        return {
-            split: {int(pose): row for row, pose in enumerate(rows) if pose != HOLE}
-            for split, rows in self._rows.items()
-        }
+    def _poses_in(self) -> dict[Split, NDArray[np.int64]]:
+        return {split: np.concatenate([np.arange(*its) for its in self.pose_spans(split)]) for split in SPLITS}
 
-    @cached_property
-    def _rows(self) -> dict[Split, NDArray[np.int64]]:
-        return {split: self._rows_in(split) for split in SPLITS}
+    def identity_spans(self, split: Split) -> list[tuple[int, int]]:
+        """Identity numbers [first, end) of a split that each step adds."""
+        counts = [count for step in self.steps for count in (step.training, step.evaluation)]
+        return self._spans(counts)[SPLITS.index(split) :: 2]
 
-    def _rows_in(self, split: Split) -> NDArray[np.int64]:
-        rows: NDArray[np.int64] = np.empty(0, np.int64)
-        first = 0
-        for step, count in zip(self.steps, self._added(split), strict=True):
-            if count:
-                holes = np.full(-len(rows) % self.rows_per_shard(split), HOLE, np.int64)
-                rows = np.concatenate([rows, holes, np.arange(first, first + count)])
-            first += step.seen + step.unseen
-        return rows
+    def pose_spans(self, split: Split) -> list[tuple[int, int]]:
+        """Pose numbers [first, end) that each step adds to the identities of a split."""
+        starts = [first for first, _ in self._spans([step.seen + step.unseen for step in self.steps])]
+        return [(first, first + count) for first, count in zip(starts, self._added(split), strict=True)]
 
-    def rows_per_shard(self, split: Split) -> int:
-        """Rows of a full shard: as the recipe says, but no more than the identities of a split had at first."""
-        return min(self.recipe.store.poses_per_shard, self._added(split)[0])
+    @staticmethod
+    def _spans(counts: list[int]) -> list[tuple[int, int]]:
+        ends = [0]
+        for count in counts:
+            ends.append(ends[-1] + count)
+        return list(pairwise(ends))
 
-    def shards_of(self, identity: int) -> Iterator[Shard]:
-        """Shards of one identity, in order; a shard never holds poses of two steps."""
-        rows, size = self.rows_of(identity), self.rows_per_shard(self.split(identity))
-        for number, start in enumerate(range(0, len(rows), size)):
-            filled = int((rows[start : start + size] != HOLE).sum())
-            yield Shard(identity, number, start, start + filled)
+    def shard_shape(self, split: Split, *, identities: int, vertices: float) -> tuple[int, int]:
+        """Identities and poses of a full shard of an array that begins with so many ``identities``.
 
-    def shards(self) -> list[Shard]:
-        """All shards, identity by identity."""
-        return [shard for identity in range(self.identity_count) for shard in self.shards_of(identity)]
+        No more meshes than the recipe says, than ``LARGEST_SHARD`` holds, and than there were at first; several
+        identities only where all first poses of one do not fill a shard.
+        """
+        most = max(1, min(self.recipe.store.poses_per_shard, int(LARGEST_SHARD // max(1, 12 * vertices))))
+        poses = min(most, self._added(split)[0])
+        return max(1, min(most // poses, identities)), poses
 
     @property
     def shard_count(self) -> int:
-        """How many shards there are; like the other counts it lists nothing, however large the grid."""
-        return sum(
-            self._identity_count(split) * sum(-(-count // self.rows_per_shard(split)) for count in self._added(split))
-            for split in SPLITS
-        )
+        """How many shards there are if identities share a topology of small meshes.
+
+        Like the other counts it lists nothing, however large the grid.
+        """
+        return sum(self._shards_in(split) for split in SPLITS)
+
+    def _shards_in(self, split: Split) -> int:
+        members = [count for step in self.steps if (count := getattr(step, split))]
+        if not members:
+            return 0
+        identities, poses = self.shard_shape(split, identities=members[0], vertices=0)
+        return sum(-(-count // identities) for count in members) * sum(-(-n // poses) for n in self._added(split))
 
     @property
     def mesh_count(self) -> int:
@@ -192,3 +212,146 @@ class Grid:
         source_pose = poses[random.integers(0, len(poses), count)]
         target_pose = (source_pose + random.integers(1, until.pose_count, count)) % until.pose_count
         return np.stack([identities[source], source_pose, identities[target], target_pose], axis=1)
+
+
+@dataclass(frozen=True)
+class GridArray:
+    """One array of vertices: the identities of a split that share a topology, in all poses of the split.
+
+    Attributes
+    ----------
+    vertices
+        Of each mesh.
+    identities, poses
+        The numbers [identity] and [pose] int32 along the two axes; ``HOLE`` where there are no meshes.
+    room
+        How many identities and poses a full shard has.
+    """
+
+    split: Split
+    topology: int
+    vertices: int
+    identities: NDArray[np.int32]
+    poses: NDArray[np.int32]
+    room: tuple[int, int]
+
+    @property
+    def path(self) -> str:
+        """Path of its group within a dataset."""
+        return f"grid/{self.split}/{self.topology}"
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the array: (identity, pose, vertex, 3)."""
+        return len(self.identities), len(self.poses), self.vertices, 3
+
+    @cached_property
+    def columns(self) -> dict[int, int]:
+        """The place of each pose along the second axis."""
+        return {pose: column for column, pose in enumerate(self.poses.tolist()) if pose != HOLE}
+
+    def place(self, row: int, column: int) -> Place:
+        """The place of the shard that is ``row`` shards along the identities and ``column`` along the poses."""
+        return SPLITS.index(self.split), self.topology, row, column
+
+    def shards(self) -> Iterator[Shard]:
+        """All shards, in the order of their places; one never holds meshes of two steps."""
+        height, width = self.room
+        poses = [_without_holes(self.poses[start : start + width]) for start in range(0, len(self.poses), width)]
+        for row, start in enumerate(range(0, len(self.identities), height)):
+            members = tuple(_without_holes(self.identities[start : start + height]))
+            for column, its in enumerate(poses):
+                span = range(its[0], its[-1] + 1)
+                yield Shard(self.place(row, column), members, span, self.vertices, self.room)
+
+    def places(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The place [shard, 4] and the number of meshes [shard] of its shards; it makes no list of these."""
+        (height, width), split = self.room, SPLITS.index(self.split)
+        rows, columns = _filled(self.identities, height), _filled(self.poses, width)
+        row, column = np.indices((len(rows), len(columns))).reshape(2, -1)
+        places = np.stack([np.full_like(row, split), np.full_like(row, self.topology), row, column], axis=1)
+        return places.astype(np.int32), np.outer(rows, columns).ravel().astype(np.int32)
+
+    @property
+    def shard_count(self) -> int:
+        """How many shards it has."""
+        height, width = self.room
+        return -(-len(self.identities) // height) * -(-len(self.poses) // width)
+
+
+class GridArrays:
+    """The arrays of vertices that hold the meshes of a grid.
+
+    Parameters
+    ----------
+    grid
+        Which meshes there are.
+    topologies
+        The topology of each identity [identity].
+    vertices
+        The vertices of a mesh of each topology [topology].
+    """
+
+    def __init__(self, grid: Grid, topologies: Sequence[int] | NDArray[np.integer], vertices: Sequence[int]) -> None:
+        self.grid, self.vertices = grid, tuple(vertices)
+        self.topologies: NDArray[np.int32] = np.array(topologies, np.int32)
+        members: dict[tuple[int, int], list[NDArray[np.int64]]] = {}
+        for number, split in enumerate(SPLITS):
+            for first, end in grid.identity_spans(split):
+                for topology, identities in _by_value(self.topologies[first:end]):
+                    members.setdefault((number, topology), []).append(first + identities)
+        self.arrays = [self._array(SPLITS[split], its, steps) for (split, its), steps in sorted(members.items())]
+
+    def _array(self, split: Split, topology: int, identities: list[NDArray[np.int64]]) -> GridArray:
+        vertices = self.vertices[topology]
+        height, width = self.grid.shard_shape(split, identities=len(identities[0]), vertices=vertices)
+        poses = [np.arange(*span) for span in self.grid.pose_spans(split)]
+        return GridArray(
+            split, topology, vertices, _with_holes(identities, height), _with_holes(poses, width), (height, width)
+        )
+
+    @cached_property
+    def _rows(self) -> dict[int, tuple[GridArray, int]]:
+        places = ((array, row) for array in self.arrays for row in np.flatnonzero(array.identities != HOLE).tolist())
+        return {int(array.identities[row]): (array, row) for array, row in places}
+
+    def row_of(self, identity: int) -> tuple[GridArray, int]:
+        """The array that holds an identity, and its place along the first axis (KeyError where there is none)."""
+        return self._rows[identity]
+
+    @property
+    def shard_count(self) -> int:
+        """How many shards there are; it lists none."""
+        return sum(array.shard_count for array in self.arrays)
+
+    def places(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The place [shard, 4] and the number of meshes [shard] of all shards, ordered by place."""
+        found = [array.places() for array in self.arrays]
+        return np.concatenate([places for places, _ in found]), np.concatenate([rows for _, rows in found])
+
+    def shards(self) -> list[Shard]:
+        """All shards, ordered by place."""
+        return [shard for array in self.arrays for shard in array.shards()]
+
+
+def _by_value(values: NDArray[np.int32]) -> list[tuple[int, NDArray[np.int64]]]:
+    """Each value that occurs, and where."""
+    order = np.argsort(values, kind="stable")
+    places = np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
+    return [(int(values[its[0]]), its) for its in places if len(its)]
+
+
+def _with_holes(steps: Sequence[NDArray[np.int64]], size: int) -> NDArray[np.int32]:
+    """The numbers that each step adds, each step's beginning at a multiple of ``size``."""
+    padded = [np.concatenate([step, np.full(-len(step) % size, HOLE)]) for step in steps if len(step)]
+    numbers = np.concatenate(padded)
+    return numbers[: np.flatnonzero(numbers != HOLE)[-1] + 1].astype(np.int32)
+
+
+def _filled(numbers: NDArray[np.int32], size: int) -> NDArray[np.int64]:
+    """How many places of each run of ``size`` are no holes."""
+    return np.add.reduceat(numbers != HOLE, np.arange(0, len(numbers), size), dtype=np.int64)
+
+
+def _without_holes(numbers: NDArray[np.int32]) -> list[int]:
+    return [number for number in numbers.tolist() if number != HOLE]

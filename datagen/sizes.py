@@ -5,13 +5,14 @@ docs/results/benchmarks.md, memory from peaks of whole generations (legs of 32 t
 """
 
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 from datagen.bodies import load_body
 from datagen.common.errors import DsffnetError, RecipeError, StorageError
 from datagen.common.resources import bytes_text, free_disk, free_memory
 from datagen.common.seeding import Stream, generator
-from datagen.grid import Grid
+from datagen.grid import SPLITS, Grid
 from datagen.recipe import DatasetRecipe
 
 _VERTEX = 12
@@ -119,7 +120,7 @@ def _sized(recipe: DatasetRecipe, vertices: float | None, workers: int) -> Datas
 
 def _memory_of(grid: Grid, vertices: float, workers: int) -> dict[str, float]:
     """Bytes of memory by the key of the recipe that they are owed to."""
-    rows = max(grid.rows_per_shard("training"), grid.rows_per_shard("evaluation"))
+    rows = max(prod(grid.shard_shape(split, identities=grid.identity_count, vertices=vertices)) for split in SPLITS)
     return {
         "data.identities": _MEMORY_IDENTITY * grid.identity_count,
         "data.poses": _MEMORY_POSE * grid.pose_count,

@@ -10,6 +10,7 @@ summation does not matter, and the bytes of a shard do not depend on the CPU, th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +20,10 @@ from datagen.mesh.rig import Rig, part_transforms
 
 _POSES_AT_ONCE = 32  # bounds memory: 32 poses x 13,718 vertices x 3 coordinates x 8 bytes = 11 MB, about a CPU cache
 _COARSE, _FINE = 2.0**20, 2.0**24
+_FEW_JOINTS = 3  # of so many a dense product is the quicker one; exact as it is, its numbers are the same
 _EXACT_WITHIN = 4.0  # metres from the origin; a larger body's steps are larger by powers of two
+
+Weights: TypeAlias = NDArray[np.float64] | scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Rest:
 
     vertices: NDArray[np.float64]
     joints: NDArray[np.float64]
-    weights: NDArray[np.float64] | scipy.sparse.csr_array
+    weights: Weights
     parents: Sequence[int]
 
 
@@ -48,7 +52,8 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     coarse, fine = _COARSE / scale, _FINE / scale
     rest = Rest(_round(rest.vertices, coarse), _round(rest.joints, fine), rest.weights, rest.parents)
     world = _round(world, _COARSE)
-    weights = scipy.sparse.csr_array(rest.weights)
+    few = isinstance(rest.weights, np.ndarray) and rest.weights.shape[1] <= _FEW_JOINTS
+    weights = rest.weights if few else scipy.sparse.csr_array(rest.weights)
     factors = _factors(rest.vertices, weights, fine)
     posed = np.empty((len(world), len(rest.vertices), 3), np.float32)
     for first in range(0, len(world), _POSES_AT_ONCE):
@@ -100,22 +105,23 @@ def rig_of(
     )
 
 
-def _factors(vertices: NDArray[np.float64], weights: scipy.sparse.csr_array, fine: float) -> scipy.sparse.csr_array:
-    """Sparse [vertex, 4 joint]: weight times (x, y, z, 1)."""
-    entries = weights.tocoo()
+def _factors(vertices: NDArray[np.float64], weights: Weights, fine: float) -> Weights:
+    """[vertex, 4 joint], sparse where the weights are: weight times (x, y, z, 1)."""
     homogeneous = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
-    values = _round(entries.data[:, None] * homogeneous[entries.row], fine)
-    columns = entries.col[:, None] * 4 + np.arange(4, dtype=entries.col.dtype)
+    if isinstance(weights, np.ndarray):
+        return _round(weights[:, :, None] * homogeneous[:, None], fine).reshape(len(vertices), -1)
+    rows = np.repeat(np.arange(len(vertices)), np.diff(weights.indptr))
+    values = _round(weights.data[:, None] * homogeneous[rows], fine)
+    columns = weights.indices[:, None] * 4 + np.arange(4, dtype=weights.indices.dtype)
     shape = (weights.shape[0], 4 * weights.shape[1])
-    return scipy.sparse.csr_array((values.ravel(), (np.repeat(entries.row, 4), columns.ravel())), shape=shape)
+    return scipy.sparse.csr_array((values.ravel(), columns.ravel(), 4 * weights.indptr), shape=shape)
 
 
-def _turned(
-    weights: scipy.sparse.csr_array, world: NDArray[np.float64], correctives: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _turned(weights: Weights, world: NDArray[np.float64], correctives: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correctives turned by each vertex' blended rotation: sum over k of w_k R_k d."""
     poses, joints = world.shape[:2]
-    factors = scipy.sparse.csr_array((_round(weights.data, _FINE), weights.indices, weights.indptr), weights.shape)
+    factors = scipy.sparse.csr_array(weights)
+    factors.data = _round(factors.data, _FINE)
     blended = (factors @ np.ascontiguousarray(world.transpose(1, 0, 2, 3)).reshape(joints, -1)).reshape(-1, poses, 3, 3)
     turned = _round(blended, _COARSE) @ _round(correctives, _FINE).transpose(1, 0, 2)[..., None]
     return np.asarray(turned[..., 0].transpose(1, 0, 2))

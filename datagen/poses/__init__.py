@@ -10,7 +10,7 @@ To add a source: one module here that defines a class with the members of :class
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib import import_module
 from typing import Protocol
 
@@ -40,7 +40,11 @@ class Poses:
         return Poses(self.joints, self.parents, self.rotations[poses])
 
     def world(self) -> NDArray[np.float64]:
-        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes."""
+        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes; kept, for the next identity."""
+        return self._world
+
+    @cached_property
+    def _world(self) -> NDArray[np.float64]:
         return world_rotations(self.rotations, self.parents)
 
     def on(self, names: Sequence[str | None], parents: Sequence[int]) -> NDArray[np.float64]:

@@ -1,8 +1,11 @@
-"""Arrays of a dataset, read with the format in mind: another shape, type or codec is damage, and takes no memory."""
+"""Arrays of a dataset, written and read with the format in mind: anything else is damage, and takes no memory.
 
+Metadata are written by this module to the byte, so that a reader compares them as a whole. Zarr reads them (tested).
+"""
+
+import json
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,13 +13,16 @@ import zarr
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
-from datagen.common.errors import UnsafeFileError, reason_of
-from datagen.store.codec import LARGEST_CHUNK, require_plausible
-from datagen.store.schema import identity_name, parse_json, read_bytes, vertices_path
+from datagen.common.errors import ShardDamage, UnsafeFileError, reason_of
+from datagen.grid import GridArray
+from datagen.store.codec import LARGEST_CHUNK, ShardCodec, require_plausible
+from datagen.store.objects import put_bytes, read_bytes
 
-_NUMBER = re.compile("[0-9]{1,9}")
 Shape = tuple[int | None, ...]
 """Of an array, as far as it is known; None where any size will do."""
+_LEVEL = 3
+_LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC = {"name": "crc32c"}
 
 
 class ArrayDamage(ValueError):
@@ -27,41 +33,191 @@ class ArrayDamage(ValueError):
         self.path, self.reason = path, reason
 
 
-def read_array(group: zarr.Group, path: str, dtype: str, shape: Shape, *, objects: Iterable[str] = ()) -> NDArray[Any]:
-    """A small array: one chunk, little-endian, zstd.
+def put_array(group: zarr.Group, path: str, values: NDArray[Any], dimensions: Sequence[str]) -> None:
+    """Store a small array in one chunk: little-endian, zstd with its checksum. What is there already is left alone."""
+    put_json(group, f"{path}/zarr.json", _small_metadata(values.dtype, values.shape, dimensions))
+    if values.size:
+        put_bytes(
+            group, _chunk_path(path, values.shape), Zstd(_LEVEL, checksum=True).encode(np.ascontiguousarray(values))
+        )
+
+
+def put_json(group: zarr.Group, path: str, document: dict[str, Any]) -> None:
+    """Store metadata, unless it is there already."""
+    put_bytes(group, path, json.dumps(document, indent=2).encode())
+
+
+def put_group(group: zarr.Group, path: str, attributes: dict[str, Any] | None = None) -> None:
+    """Store the metadata of a group below the root."""
+    put_json(group, f"{path}/zarr.json", {"attributes": attributes or {}, "zarr_format": 3, "node_type": "group"})
+
+
+def put_vertices_metadata(group: zarr.Group, array: GridArray, codec: ShardCodec) -> None:
+    """Store the metadata of an array of vertices: NaN fill, one mesh a chunk, Blosc with shuffle, crc32c."""
+    put_json(group, f"{array.path}/vertices/zarr.json", vertices_metadata(array, codec))
+
+
+def read_array(group: zarr.Group, path: str, dtype: str, shape: Shape) -> NDArray[Any]:
+    """Return a small array.
 
     Parameters
     ----------
     dtype
         As Zarr names it: int32, float64.
-    objects
-        Paths that the dataset's manifest names. A chunk that is not there is all zeros, unless the manifest has it.
 
     Raises
     ------
     ArrayDamage
         It is missing, of another shape, type or codec, or cannot be read or decoded.
     """
-    found = _shape_of(group, path, dtype, shape, codecs=[("bytes", "little"), ("zstd", None)])
-    size, chunk = math.prod(found) * np.dtype(dtype).itemsize, f"{path}/c/" + "/".join("0" * len(found))
-    content = _read(group, chunk, limit=size + size // 128 + 2**10) if size else None
-    if content is None and size and chunk in objects:
-        raise ArrayDamage(chunk, "missing")
+    found = _checked_shape(group, path, np.dtype(dtype), shape)
+    size, chunk = math.prod(found) * np.dtype(dtype).itemsize, _chunk_path(path, found)
+    if not size:
+        return np.empty(found, dtype)
+    content = _read(group, chunk, limit=size + size // 128 + 2**10)
     try:
-        require_plausible(size, stored=len(content or b""))
-        values = np.zeros(found, dtype)
-        if content:
-            _decompress(content, values)
+        require_plausible(size, stored=len(content))
+        values = np.empty(found, dtype)
+        _decompress(content, values)
     except (RuntimeError, ValueError, IndexError) as error:
         raise ArrayDamage(chunk, f"cannot be decoded ({error})") from error
     return values
 
 
-def _read(group: zarr.Group, path: str, *, limit: int | None = None) -> bytes | None:
+def check_vertices(group: zarr.Group, array: GridArray, codec: ShardCodec, *, stored: int) -> None:
+    """Refuse an array of vertices whose metadata are not as the format has them.
+
+    Parameters
+    ----------
+    stored
+        Bytes of its first shard, which must not be a thousandth of what its meshes take.
+
+    Raises
+    ------
+    ArrayDamage
+        The metadata are missing or others, or name meshes that cannot be.
+    """
+    path = f"{array.path}/vertices/zarr.json"
+    _compare(path, read_json(group, path), vertices_metadata(array, codec))
+    first = next(array.shards())
     try:
-        return read_bytes(group, path, limit=limit)
+        require_plausible(first.rows * codec.mesh_bytes, stored=stored)
+    except ShardDamage as error:
+        raise ArrayDamage(path, f"meshes of {array.vertices} vertices: {error}") from error
+
+
+def read_json(group: zarr.Group, path: str) -> dict[str, Any]:
+    """Return the metadata of an array or a group.
+
+    Raises
+    ------
+    ArrayDamage
+        They are missing, cannot be read, or are no JSON object.
+    """
+    try:
+        document = json.loads(_read(group, path))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, ArrayDamage):
+            raise
+        raise ArrayDamage(path, f"no JSON ({reason_of(error)})") from error
+    if not isinstance(document, dict):
+        raise ArrayDamage(path, "no metadata")
+    return document
+
+
+def vertices_metadata(array: GridArray, codec: ShardCodec) -> dict[str, Any]:
+    """The metadata of an array of vertices."""
+    blosc = {"typesize": 4, "cname": codec.compressor, "clevel": codec.level, "shuffle": "shuffle", "blocksize": 0}
+    mesh = [codec.vertices, 3]
+    sharding = {
+        "chunk_shape": [1, 1, *mesh],
+        "codecs": [_LITTLE, {"name": "blosc", "configuration": blosc}, _CRC],
+        "index_codecs": [_LITTLE, _CRC],
+        "index_location": "end",
+    }
+    return _metadata(
+        np.dtype(np.float32),
+        array.shape,
+        ("identity", "pose", "vertex", "coordinate"),
+        chunk=(codec.identities, codec.poses, *mesh),
+        codecs=[{"name": "sharding_indexed", "configuration": sharding}],
+        fill="NaN",
+    )
+
+
+def _small_metadata(dtype: np.dtype[Any], shape: Sequence[int], dimensions: Sequence[str]) -> dict[str, Any]:
+    zstd = {"name": "zstd", "configuration": {"level": _LEVEL, "checksum": True}}
+    order = {"name": "bytes"} if dtype.itemsize == 1 else _LITTLE
+    fill = 0.0 if dtype.kind == "f" else 0
+    return _metadata(dtype, shape, dimensions, chunk=[max(1, size) for size in shape], codecs=[order, zstd], fill=fill)
+
+
+def _metadata(
+    dtype: np.dtype[Any],
+    shape: Sequence[int],
+    dimensions: Sequence[str],
+    *,
+    chunk: Sequence[int],
+    codecs: Any,
+    fill: Any,
+) -> dict[str, Any]:
+    """Metadata of an array as Zarr v3 has them."""
+    return {
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": fill,
+        "codecs": codecs,
+        "attributes": {},
+        "dimension_names": list(dimensions),
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+
+
+def _checked_shape(group: zarr.Group, path: str, dtype: np.dtype[Any], shape: Shape) -> tuple[int, ...]:
+    """The shape in a small array's metadata, which must be as this module writes them."""
+    where = f"{path}/zarr.json"
+    document = read_json(group, where)
+    found: Any = document.get("shape")
+    if not _fits(found, shape) or math.prod(found) * dtype.itemsize > LARGEST_CHUNK:
+        raise ArrayDamage(where, f"shape {_brief(found)} instead of {_brief(shape)}")
+    expected = _small_metadata(dtype, found, ())
+    _compare(where, document, {name: value for name, value in expected.items() if name != "dimension_names"})
+    return tuple(found)
+
+
+def _compare(path: str, document: dict[str, Any], expected: dict[str, Any]) -> None:
+    if document.get("shape") != expected["shape"]:
+        raise ArrayDamage(path, f"shape {_brief(document.get('shape'))} instead of {_brief(expected['shape'])}")
+    for name, value in expected.items():
+        if document.get(name) != value:
+            raise ArrayDamage(path, f"another {name.replace('_', ' ')} than the format has")
+
+
+def _fits(found: Any, shape: Shape) -> bool:
+    return (
+        isinstance(found, list)
+        and len(found) == len(shape)
+        and all(type(size) is int and size >= 0 for size in found)
+        and all(wanted in (None, size) for size, wanted in zip(found, shape, strict=True))
+    )
+
+
+def _chunk_path(path: str, shape: Sequence[int]) -> str:
+    return "/".join([path, "c", *"0" * len(shape)])
+
+
+def _read(group: zarr.Group, path: str, *, limit: int | None = None) -> bytes:
+    try:
+        content = read_bytes(group, path, limit=limit)
     except (OSError, UnsafeFileError) as error:
         raise ArrayDamage(path, f"cannot be read: {reason_of(error)}") from error
+    if content is None:
+        raise ArrayDamage(path, "missing")
+    return content
 
 
 def _decompress(content: bytes, out: NDArray[Any]) -> None:
@@ -78,120 +234,6 @@ def _content_size(frame: bytes) -> int | None:
     start = 5 + (1 - single) + (0, 1, 2, 4)[frame[4] & 3]
     size = int.from_bytes(frame[start : start + width], "little")
     return size + 256 * (flags == 1) if width else None
-
-
-def read_vertex_count(group: zarr.Group, identity: int, *, rows: int | None, rows_per_shard: int) -> int:
-    """Vertices of an identity's meshes, from the metadata of their array.
-
-    Raises
-    ------
-    ArrayDamage
-        The metadata is missing, or not what the format says, for so many ``rows`` and rows of a shard.
-    """
-    return read_vertices_shape(group, identity, rows=rows, rows_per_shard=rows_per_shard)[1]
-
-
-def read_vertices_shape(
-    group: zarr.Group, identity: int, *, rows: int | None = None, rows_per_shard: int
-) -> tuple[int, ...]:
-    """Shape (row, vertex, 3) of the array of an identity's meshes, see :func:`read_vertex_count`."""
-    inner = [("bytes", "little"), ("blosc", None), ("crc32c", None)]
-    codecs = [("sharding_indexed", (inner, [inner[0], inner[2]], "end"))]
-    path = vertices_path(identity)
-    found = _shape_of(group, path, "float32", (rows, None, 3), codecs=codecs, chunk=rows_per_shard)
-    if not 0 < 12 * found[1] <= LARGEST_CHUNK:
-        raise ArrayDamage(f"{path}/zarr.json", f"meshes of {found[1]:,} vertices")
-    return found
-
-
-def read_topology(group: zarr.Group, identity: int) -> str:
-    """Name of the topology that an identity has.
-
-    Raises
-    ------
-    ArrayDamage
-        The identity's attributes are missing, or name none.
-    """
-    path = f"identity/{identity_name(identity)}/zarr.json"
-    attributes = _document(group, path).get("attributes")
-    name = attributes.get("topology") if isinstance(attributes, dict) else None
-    if not (isinstance(name, str) and _NUMBER.fullmatch(name)):
-        raise ArrayDamage(path, f"its topology is {name!r:.60}, not a number")
-    return name
-
-
-def _shape_of(
-    group: zarr.Group, path: str, dtype: str, shape: Shape, *, codecs: list[Any], chunk: int | None = None
-) -> tuple[int, ...]:
-    """The shape in an array's metadata, which must be of these codecs; a chunk has ``chunk`` rows, or all."""
-    where = f"{path}/zarr.json"
-    document = _document(group, where)
-    found: Any = document.get("shape")
-    if not _fits(found, shape) or math.prod(found) * np.dtype(dtype).itemsize > _most(chunk):
-        raise ArrayDamage(where, f"shape {_brief(found)} instead of {_brief(shape)}")
-    wanted = {
-        "node_type": "array",
-        "data_type": dtype,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": _chunk_shape(found, chunk)}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": codecs,
-    }
-    stated = {**document, "codecs": _codecs(document.get("codecs"), found)}
-    for name, value in wanted.items():
-        if stated.get(name) != value:
-            raise ArrayDamage(where, f"another {name.replace('_', ' ')} than the format has")
-    return tuple(found)
-
-
-def _most(chunk: int | None) -> float:
-    """The most bytes of an array; one in many shards has no limit as a whole."""
-    return LARGEST_CHUNK if chunk is None else math.inf
-
-
-def _fits(found: Any, shape: Shape) -> bool:
-    return (
-        isinstance(found, list)
-        and len(found) == len(shape)
-        and all(type(size) is int and size >= 0 for size in found)
-        and all(wanted in (None, size) for size, wanted in zip(found, shape, strict=True))
-    )
-
-
-def _chunk_shape(shape: Sequence[int], rows: int | None) -> list[int]:
-    whole = [max(1, size) for size in shape]
-    return whole if rows is None else [rows, *whole[1:]]
-
-
-def _codecs(stated: Any, shape: Sequence[int]) -> list[Any] | None:
-    """Names of codecs and what of their configuration decides how bytes are read; None where they make no sense."""
-    try:
-        return [_codec(codec["name"], codec.get("configuration", {}), shape) for codec in stated]
-    except (TypeError, KeyError, AttributeError, RecursionError):
-        return None
-
-
-def _codec(name: Any, configuration: Mapping[str, Any], shape: Sequence[int]) -> tuple[Any, Any]:
-    if name == "bytes":
-        return name, configuration["endian"]
-    if name != "sharding_indexed":
-        return name, None
-    if configuration["chunk_shape"] != [1, *shape[1:]]:
-        raise KeyError("chunk_shape")
-    inner, index = (_codecs(configuration[key], shape[:0]) for key in ("codecs", "index_codecs"))
-    return name, (inner, index, configuration["index_location"])
-
-
-def _document(group: zarr.Group, path: str) -> dict[str, Any]:
-    content = _read(group, path)
-    if content is None:
-        raise ArrayDamage(path, "missing")
-    try:
-        document = parse_json(content)
-    except ValueError as error:
-        raise ArrayDamage(path, f"no JSON ({error})") from error
-    if not isinstance(document, dict):
-        raise ArrayDamage(path, "no metadata")
-    return document
 
 
 def _brief(shape: Any) -> str:

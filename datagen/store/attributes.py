@@ -1,24 +1,15 @@
-"""The root attributes of a dataset: what they say, and whether a recipe and its assets fit those that are there."""
+"""The root attributes of a dataset: their types, and whether a recipe and its assets fit those that are there."""
 
-import importlib.metadata
-import subprocess
-import uuid
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
-import numpy as np
 import zarr
-from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
-from datagen.bodies import BodyModel
 from datagen.common.errors import DatasetError
-from datagen.grid import POSE_TYPES, Grid
-from datagen.poses import load_poses
 from datagen.recipe import DatasetRecipe
-from datagen.store.schema import FORMAT_VERSION, attributes_of, check_version, identity_name, stored_recipe
+from datagen.store.schema import attributes_of, check_version, stored_recipe
 
 _Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 
@@ -93,43 +84,6 @@ def _is_tree(joints: list[str], parents: list[Any]) -> bool:
     return not joints
 
 
-_NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
-_PACKAGES = ("anny", "smplx", "numpy", "scipy", "zarr", "numcodecs")
-
-
-def stated(recipe: DatasetRecipe, body: BodyModel) -> dict[str, Any]:
-    """What follows from a recipe and its assets alone; an existing dataset must say the same."""
-    grid, digest = Grid(recipe), recipe.sha256()
-    assets, poses = assets_of(recipe, body), load_poses(recipe.poses)
-    identities = [(asset["name"], asset["version"]) for asset in assets]
-    return {
-        "format_version": FORMAT_VERSION,
-        "uuid": str(uuid.uuid5(_NAMESPACE, f"{FORMAT_VERSION} {digest} {sorted(identities)}")),
-        "recipe": recipe.model_dump(mode="json"),
-        "recipe_sha256": digest,
-        "body": {"family": recipe.body.family, "assets": assets, "parameters": list(body.parameter_names)},
-        "units": "metres",
-        "frame": "Y up, facing +Z, +X to the body's left",
-        "joints": list(poses.joints),
-        "joint_parents": list(poses.parents),
-        "splits": {
-            "identities": {identity_name(i): grid.split(i) for i in range(grid.identity_count)},
-            "poses": {kind: _spans(grid.poses(kind)) for kind in POSE_TYPES},
-        },
-    }
-
-
-def assets_of(recipe: DatasetRecipe, body: BodyModel) -> list[dict[str, str]]:
-    """What the bytes depend on beside the recipe: the body's files and packages, and the poses'."""
-    return [vars(asset) for asset in dict.fromkeys([*body.assets, *load_poses(recipe.poses).assets])]
-
-
-def _spans(numbers: NDArray[np.int64]) -> list[list[int]]:
-    """Numbers as a few ranges [first, end)."""
-    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
-    return [[int(run[0]), int(run[-1]) + 1] for run in np.split(numbers, breaks) if len(run)]
-
-
 def check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:
     fault = attributes_fault(group)
     if fault:
@@ -179,28 +133,12 @@ def _differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "data")
             yield f"{prefix}.{key}: {before} there, {after} here"
 
 
-def provenance(earlier: Any) -> dict[str, Any]:
-    """What makes the data here and now, and what made the part that is there already, if that was something else."""
-    now = {"packages": _versions(), "git_commit": _git_commit()}
-    before = dict(earlier) if isinstance(earlier, dict) else {}
-    history = before.pop("earlier", [])
+def with_history(now: Mapping[str, Any], before: Any) -> dict[str, Any]:
+    """The provenance of a dataset that is made on with: what makes it now, and what made the part that is there."""
+    earlier = dict(before) if isinstance(before, dict) else {}
+    history = earlier.pop("earlier", [])
     if not isinstance(history, list):
         history = []
-    if before and before != now:
-        history = [*history, before]
-    return {**now, "earlier": history} if history else now
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
-
-
-def _git_commit() -> str:
-    """Commit of the working tree this code runs from, or 'unknown' (an installed copy, a submitted job)."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=10
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
+    if earlier and earlier != now:
+        history = [*history, earlier]
+    return {**now, "earlier": history} if history else dict(now)

@@ -9,10 +9,12 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from datagen.common.errors import DatasetError, NoDataset
-from datagen.store.objects import LocalObjects, is_local, plain
-from datagen.store.schema import check_ours, delete_object, list_objects, open_group
+from datagen.store.object_names import MEMBERS
+from datagen.store.objects import LocalObjects, delete_object, is_local, list_objects, plain
+from datagen.store.schema import check_ours, check_version, open_group
 
-_MEMBERS = ("topology", "identity", "pose", "evaluation", "manifest")
+_FOLDERS = (*MEMBERS, "identity")
+"""What a dataset's root holds, the last one in format 2."""
 
 
 def remove(url: str) -> None:
@@ -28,7 +30,7 @@ def remove(url: str) -> None:
         _remove_remote(url)
         return
     folder = Path(plain(url))
-    for member in _MEMBERS:
+    for member in _FOLDERS:
         if (folder / member).is_symlink():  # what it leads to is not ours
             (folder / member).unlink()
         shutil.rmtree(folder / member, ignore_errors=not (folder / member).exists())
@@ -42,6 +44,7 @@ def _remove_remote(url: str) -> None:
         group = open_group(url, mode="r+")
     except NoDataset:
         return
+    check_version(url, group)  # of an older format other objects would be left
     for path in sorted(list_objects(group), key=lambda path: path == "zarr.json"):
         delete_object(group, path)
 
@@ -64,7 +67,7 @@ def require_ours(url: str) -> None:
     there = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
     if there and not _has_our_root(path):
         raise DatasetError(f"{url} holds what is not a dataset ({there[0]}). Choose another --out")
-    strangers = [name for name in there if not name.startswith(".") and name not in (*_MEMBERS, "zarr.json")]
+    strangers = [name for name in there if not name.startswith(".") and name not in (*_FOLDERS, "zarr.json")]
     if strangers:
         raise DatasetError(f"{url} holds what is not a dataset ({strangers[0]}). Choose another --out")
 

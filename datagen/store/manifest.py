@@ -6,51 +6,144 @@ a dataset can change unnoticed.
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import zarr
-from pydantic import TypeAdapter
+from numpy.typing import NDArray
 
 from datagen.common.errors import UnsafeFileError, reason_of
-from datagen.grid import Grid
+from datagen.grid import SPLITS, GridArrays, Place, Shard, shard_path
+from datagen.mesh.geometry import bounds
+from datagen.store.arrays import put_array, put_group, read_array, read_json
 from datagen.store.object_names import is_member, require_member
-from datagen.store.schema import (
-    ManifestRow,
-    attributes_of,
-    list_objects,
-    parse_json,
-    read_bytes,
-    require_group,
-    shard_path,
-)
+from datagen.store.objects import list_objects, read_bytes
+from datagen.store.schema import attributes_of
 
-_ROOT, _MANIFEST = "zarr.json", "manifest/zarr.json"
 _SEAL = "attributes_sha256"
+_COLUMNS = {
+    "place": ("int32", (4,), ("shard", "axis")),
+    "rows": ("int32", (), ("shard",)),
+    "bytes": ("int64", (), ("shard",)),
+    "sha256": ("uint8", (32,), ("shard", "byte")),
+    "extent": ("float32", (2, 3), ("shard", "bound", "coordinate")),
+}
+"""Arrays with a row for each shard: type, shape of a row, dimension names."""
+_MOST = 10**9
+"""Of a number in a path."""
+_OBJECTS = "manifest/object_sha256"
 
 
-def commit(group: zarr.Group, rows: Sequence[ManifestRow], attributes: dict[str, Any]) -> None:
-    """Write the manifest, then the root's last attributes with the digests of both."""
-    ordered = sorted(rows)
-    content = {
-        "shards": [row.as_json() for row in ordered],
-        "objects": {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)},
-    }
-    require_group(group, "manifest").update_attributes(content)
-    stated = {**attributes_of(group), **attributes, "manifest_sha256": _digest(content)}
-    group.update_attributes({**stated, _SEAL: _digest(_without_seal(stated))})
+@dataclass(frozen=True, order=True)
+class ManifestRow:
+    """One shard: where it lies, how many meshes it holds, its bytes and their hash, and the extent of its meshes."""
+
+    place: Place
+    rows: int
+    bytes: int
+    sha256: str
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    @property
+    def path(self) -> str:
+        """Path of its object within the dataset."""
+        return shard_path(self.place)
+
+
+def row_of(shard: Shard, content: bytes, meshes: NDArray[np.float32]) -> ManifestRow:
+    """The row of a shard that holds meshes [..., vertex, 3] as these bytes."""
+    low, high = bounds(meshes.reshape(-1, *meshes.shape[-2:]))
+    return ManifestRow(
+        place=shard.place,
+        rows=shard.rows,
+        bytes=len(content),
+        sha256=hashlib.sha256(content).hexdigest(),
+        minimum=_triple(low.min(axis=0)),
+        maximum=_triple(high.max(axis=0)),
+    )
+
+
+def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a dataset was when it was committed: its shards, and the sha256 of every other object by its path."""
+    """What a dataset was when it was committed.
 
-    shards: list[ManifestRow] = field(default_factory=list)
-    objects: dict[str, str] = field(default_factory=dict)
+    Attributes
+    ----------
+    columns
+        Of its shards, ordered by place: an array [shard, ...] for each name of ``_COLUMNS``.
+    objects
+        The sha256 of every other object by its path.
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+    objects: Mapping[str, str]
+
+    @cached_property
+    def shards(self) -> list[ManifestRow]:
+        """One row a shard."""
+        return [
+            ManifestRow(tuple(place), rows, size, bytes(sha256).hex(), tuple(low), tuple(high))
+            for place, rows, size, sha256, (low, high) in zip(
+                *(self.columns[name].tolist() for name in _COLUMNS), strict=True
+            )
+        ]
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each shard by its path."""
+        places, sizes = self.columns["place"].tolist(), self.columns["bytes"].tolist()
+        return {shard_path(place): size for place, size in zip(places, sizes, strict=True)}
+
+    @property
+    def object_hashes(self) -> NDArray[np.uint8]:
+        """The sha256 of the objects [object, 32]."""
+        return _hashes(self.objects.values())
+
+    def digest(self) -> str:
+        """The sha256 over all of it."""
+        found = hashlib.sha256(json.dumps(list(self.objects)).encode())
+        for values in (*self.columns.values(), self.object_hashes):
+            found.update(values.tobytes())
+        return found.hexdigest()
 
 
-_PARSED = TypeAdapter(Manifest)
+def manifest_of(rows: Sequence[ManifestRow], objects: Mapping[str, str]) -> Manifest:
+    """The manifest of these shards, in any order, and objects."""
+    ordered = sorted(rows)
+    columns: dict[str, Any] = {
+        "place": [row.place for row in ordered],
+        "rows": [row.rows for row in ordered],
+        "bytes": [row.bytes for row in ordered],
+        "sha256": _hashes(row.sha256 for row in ordered),
+        "extent": [(row.minimum, row.maximum) for row in ordered],
+    }
+    types = _COLUMNS.items()
+    return Manifest({name: np.array(columns[name], it).reshape(-1, *row) for name, (it, row, _) in types}, objects)
+
+
+def _hashes(digests: Iterable[str]) -> NDArray[np.uint8]:
+    return np.frombuffer(bytes.fromhex("".join(digests)), np.uint8).reshape(-1, 32)
+
+
+def commit(group: zarr.Group, rows: Sequence[ManifestRow], attributes: dict[str, Any]) -> None:
+    """Write the manifest, then the root's last attributes with the digests of both."""
+    hashes = {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)}
+    manifest = manifest_of(rows, hashes)
+    put_group(group, "manifest", {"objects": list(hashes)})
+    put_array(group, _OBJECTS, manifest.object_hashes, ("object", "byte"))
+    for name, values in manifest.columns.items():
+        put_array(group, f"manifest/{name}", values, _COLUMNS[name][2])
+    stated = {**attributes_of(group), **attributes, "manifest_sha256": manifest.digest()}
+    group.update_attributes({**stated, _SEAL: _digest(_without_seal(stated))})
 
 
 def read_manifest(group: zarr.Group) -> Manifest | None:
@@ -62,23 +155,45 @@ def read_manifest(group: zarr.Group) -> Manifest | None:
         It names what is no object of a dataset.
     """
     try:
-        content = parse_json(read_bytes(group, _MANIFEST) or b"")["attributes"]
-        if attributes_of(group).get("manifest_sha256") != _digest(content):
-            return None
-        manifest = _PARSED.validate_python(content)
-    except (ValueError, TypeError, KeyError, RecursionError, OSError, UnsafeFileError):
+        manifest = stored_manifest(group)
+    except (ValueError, TypeError, KeyError):
         return None
-    for path in (*manifest.objects, *(row.path for row in manifest.shards)):
+    if attributes_of(group).get("manifest_sha256") != manifest.digest():
+        return None
+    for path in manifest.objects:
         require_member(path)
     return manifest
 
 
-def covers(manifest: Manifest, grid: Grid) -> bool:
+def stored_manifest(group: zarr.Group) -> Manifest:
+    """The manifest that is stored, whether or not it is the one that was committed.
+
+    Raises
+    ------
+    ValueError, TypeError, KeyError
+        It is damaged.
+    """
+    paths = read_json(group, "manifest/zarr.json")["attributes"]["objects"]
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise TypeError("objects")
+    hashes = read_array(group, _OBJECTS, "uint8", (len(paths), 32))
+    count = len(read_array(group, "manifest/rows", "int32", (None,)))
+    columns = {
+        name: read_array(group, f"manifest/{name}", dtype, (count, *shape))
+        for name, (dtype, shape, _) in _COLUMNS.items()
+    }
+    place = columns["place"]
+    if ((place < 0) | (place >= [len(SPLITS), *3 * [_MOST]])).any():
+        raise ValueError("place")
+    return Manifest(columns, {path: sha256.tobytes().hex() for path, sha256 in zip(paths, hashes, strict=True)})
+
+
+def covers(manifest: Manifest, arrays: GridArrays) -> bool:
     """Whether a manifest lists the shards of a grid and no others; none are listed where their number differs."""
-    if len(manifest.shards) != grid.shard_count:
+    if len(manifest.columns["rows"]) != arrays.shard_count:
         return False
-    rows = {shard_path(shard): shard.rows for shard in grid.shards()}
-    return {row.path: row.rows for row in manifest.shards} == rows
+    places, rows = arrays.places()
+    return np.array_equal(places, manifest.columns["place"]) and np.array_equal(rows, manifest.columns["rows"])
 
 
 def is_sealed(group: zarr.Group) -> bool:
@@ -103,7 +218,7 @@ def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str
 
 def _small_objects(group: zarr.Group) -> list[str]:
     paths = (path for path in list_objects(group) if is_member(path) and "/vertices/c/" not in path)
-    return [path for path in paths if path not in (_ROOT, _MANIFEST)]
+    return [path for path in paths if path != "zarr.json" and not path.startswith("manifest/")]
 
 
 def _without_seal(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -9,18 +9,25 @@ from datagen.store.codec import LARGEST_CHUNK
 
 _NUMBER = "[0-9]{1,9}"
 _MEMBER = re.compile(
-    rf"""(?:(?:topology|identity|pose|evaluation|manifest)/)?zarr\.json
-    |topology/{_NUMBER}/(?:faces/)?zarr\.json|topology/{_NUMBER}/faces/c/0/0
-    |identity/{_NUMBER}/(?:(?:vertices|pose|parameters)/)?zarr\.json
-    |identity/{_NUMBER}/(?:vertices/c/{_NUMBER}/0/0|(?:pose|parameters)/c/0)
+    rf"""(?:(?:grid|grid/training|grid/evaluation|topology|pose|evaluation|manifest)/)?zarr\.json
+    |grid/topology/(?:zarr\.json|c/0)
+    |grid/(?:training|evaluation)/{_NUMBER}/(?:zarr\.json|(?:vertices|identity|pose|parameters)/zarr\.json
+        |(?:identity|pose)/c/0|parameters/c/0/0|vertices/c/{_NUMBER}/{_NUMBER}/0/0)
+    |topology/vertex_count/(?:zarr\.json|c/0)
+    |topology/{_NUMBER}/(?:zarr\.json|faces/zarr\.json|faces/c/0/0)
     |pose/parameters/(?:zarr\.json|c/0/0/0)
-    |evaluation/(?:seen|unseen)/(?:zarr\.json|c/0/0)""",
+    |evaluation/(?:seen|unseen)/(?:zarr\.json|c/0/0)
+    |manifest/(?:rows|bytes)/(?:zarr\.json|c/0)
+    |manifest/(?:place|sha256|object_sha256)/(?:zarr\.json|c/0/0)
+    |manifest/extent/(?:zarr\.json|c/0/0/0)""",
     re.VERBOSE,
 )
+MEMBERS = ("grid", "topology", "pose", "evaluation", "manifest")
+"""The groups that a dataset's root holds."""
 _LEFTOVER = re.compile(r"(?:[a-z0-9]+/)*[a-z0-9]+\.[0-9a-f]+\.partial")
 """What a killed writer leaves of an object."""
 LONGEST_LIST = 2**27
-"""Bytes of zarr.json and manifest/zarr.json, which grow with the dataset."""
+"""Bytes of zarr.json and manifest/zarr.json, which grow with the steps and the topologies of a dataset."""
 _LONGEST_METADATA = 2**20
 _LONGEST_ARRAY = LARGEST_CHUNK + 2**24
 
@@ -55,8 +62,9 @@ def limit_of(path: str) -> int:
 
 
 def require_short(path: str, content: Buffer) -> None:
+    """Refuse to write metadata that readers would refuse to read (DatasetError)."""
     if path.endswith("zarr.json") and len(content) > limit_of(path):
         raise DatasetError(
             f"{path} would have {len(content):,} bytes, more than the {limit_of(path):,} that readers take. Make "
-            "fewer and larger shards: data.store.poses_per_shard"
+            "several datasets"
         )

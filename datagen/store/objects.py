@@ -8,15 +8,17 @@ regular files only.
 import os
 import stat
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import zarr
 from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.core.sync import sync
 from zarr.storage import LocalStore
 
 from datagen.common.errors import DatasetError, UnsafeFileError
 from datagen.common.files import open_regular, read_bounded, resolve_within
-from datagen.store.object_names import is_leftover, limit_of, require_member, require_short
+from datagen.store.object_names import is_leftover, is_member, limit_of, require_member, require_short
 from datagen.store.remote_objects import S3_OPTIONS, RemoteObjects
 
 
@@ -163,3 +165,54 @@ def open_objects(url: str, *, read_only: bool) -> Objects:
     if on_s3:
         remote.fs.retries = 1  # those of _patiently are the only ones, so that their time is known
     return remote
+
+
+def read_bytes(
+    group: zarr.Group, path: str, *, limit: int | None = None, byte_range: ByteRequest | None = None
+) -> bytes | None:
+    """Bytes of one object of the dataset's store, all or a range of them; None where there is none.
+
+    Raises
+    ------
+    UnsafeFileError
+        No object of a dataset is called so, or what is there is not a regular file of at most ``limit`` bytes inside.
+    OSError
+        It cannot be read.
+    StorageError
+        A remote store does not answer.
+    """
+    return cast(Objects, group.store).read(path, limit=limit, byte_range=byte_range)
+
+
+def write_bytes(group: zarr.Group, path: str, content: bytes) -> None:
+    """Write one object of the dataset's store whole, in the place of any that is there."""
+    sync(group.store.set(path, default_buffer_prototype().buffer.from_bytes(content)))
+
+
+def put_bytes(group: zarr.Group, path: str, content: bytes) -> None:
+    """Write one object unless it is there with these bytes already."""
+    try:
+        present = read_bytes(group, path)
+    except (OSError, UnsafeFileError):
+        present = None
+    if present != content:
+        write_bytes(group, path, content)
+
+
+def delete_object(group: zarr.Group, path: str) -> None:
+    """Remove one object of the dataset's store, if it is there."""
+    sync(group.store.delete(path))
+
+
+def list_objects(group: zarr.Group) -> list[str]:
+    """Paths of all objects of the dataset's store, and of what killed writers left of some, sorted."""
+
+    async def listed() -> list[str]:
+        return [key async for key in group.store.list_prefix("")]
+
+    return sorted(path for path in sync(listed()) if is_member(path) or is_leftover(path))
+
+
+def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:
+    """Size in bytes of each path that exists and is a file."""
+    return cast(Objects, group.store).sizes(paths)

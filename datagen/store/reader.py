@@ -1,6 +1,6 @@
 """Reading a dataset: only a complete and sound one; anything else is an error that names the mending command."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,28 +13,18 @@ from numpy.typing import NDArray
 from zarr.abc.store import ByteRequest, RangeByteRequest, SuffixByteRequest
 
 from datagen.common.errors import DatasetError, ShardDamage, UnsafeFileError, reason_of
-from datagen.grid import Grid, PoseType, Split
-from datagen.poses import Poses
+from datagen.grid import Grid, GridArray, GridArrays, PoseType, Split, shard_path
 from datagen.recipe import DatasetRecipe
-from datagen.store.arrays import ArrayDamage, read_array, read_topology, read_vertex_count
+from datagen.store.arrays import ArrayDamage, check_vertices, read_array
 from datagen.store.attributes import attributes_fault
-from datagen.store.codec import ShardCodec, require_plausible
-from datagen.store.manifest import Manifest, covers, is_sealed, read_manifest
-from datagen.store.schema import (
-    ManifestRow,
-    attributes_of,
-    check_version,
-    codec_of,
-    identity_name,
-    open_group,
-    read_bytes,
-    stored_recipe,
-    stored_sizes,
-    vertices_path,
-)
+from datagen.store.codec import ShardCodec
+from datagen.store.manifest import Manifest, ManifestRow, covers, is_sealed, read_manifest
+from datagen.store.objects import read_bytes, stored_sizes
+from datagen.store.schema import attributes_of, check_version, codec_of, open_group, stored_arrays, stored_recipe
 
 Meshes = NDArray[np.float32]
-_WHOLE_FROM = 4  # a shard is read whole where at least a quarter of it is wanted
+_TOGETHER_FROM = 4  # the part of a shard that holds some meshes is read at once where a quarter of it is wanted
+_MOST_INDEXES = 4096  # of shards, that are kept
 
 
 @dataclass(frozen=True)
@@ -66,7 +56,7 @@ class Dataset:
 
     @cached_property
     def manifest(self) -> list[ManifestRow]:
-        """One row a shard, ordered by path."""
+        """One row a shard, ordered by place."""
         return self.committed.shards if self.committed else []
 
     @cached_property
@@ -74,9 +64,22 @@ class Dataset:
         """What the dataset was when it was committed; None where its manifest is damaged."""
         return read_manifest(self.group)
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each shard by its path."""
+        return self.committed.sizes if self.committed else {}
+
     @cached_property
-    def _sizes(self) -> dict[str, int]:
-        return {row.path: row.bytes for row in self.manifest}
+    def arrays(self) -> GridArrays:
+        """The arrays of vertices that the dataset has for its grid.
+
+        Raises
+        ------
+        DatasetError
+            What says so is missing or damaged.
+        """
+        with self._damage():
+            return stored_arrays(self.group, self.grid)
 
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
@@ -84,55 +87,69 @@ class Dataset:
 
     def faces(self, identity: int) -> NDArray[np.int32]:
         """Triangles [face, 3] of an identity."""
-        with self._damage():
-            topology, vertices = read_topology(self.group, identity), self.vertex_count(identity)
-            if (topology, vertices) not in self._topologies:
-                self._topologies[topology, vertices] = self._faces_of(topology, vertices)
-        return self._topologies[topology, vertices]
+        topology = int(self.arrays.topologies[identity])
+        if topology not in self._topologies:
+            with self._damage():
+                self._topologies[topology] = self._faces_of(topology)
+        return self._topologies[topology]
 
-    def _faces_of(self, topology: str, vertices: int) -> NDArray[np.int32]:
-        path = f"topology/{topology}/faces"
-        faces = self._small(path, "int32", (None, 3))
+    def _faces_of(self, topology: int) -> NDArray[np.int32]:
+        path, vertices = f"topology/{topology}/faces", self.arrays.vertices[topology]
+        faces = read_array(self.group, path, "int32", (None, 3))
         if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
             raise ArrayDamage(f"{path}/c/0/0", f"a face of other vertices than the {vertices} that there are")
         return faces
 
     def parameters(self, identity: int) -> NDArray[np.float64]:
         """Body-model parameters [parameter] of an identity."""
-        count = len(self.attributes["body"]["parameters"])
-        with self._damage():
-            return self._small(f"identity/{identity_name(identity)}/parameters", "float64", (count,))
+        array, row = self.arrays.row_of(identity)
+        if array.path not in self._parameters:
+            shape = len(array.identities), len(self.attributes["body"]["parameters"])
+            with self._damage():
+                self._parameters[array.path] = read_array(self.group, f"{array.path}/parameters", "float64", shape)
+        return self._parameters[array.path][row]
 
-    def poses(self) -> Poses:
-        """The poses of the whole dataset, over its named joints."""
-        joints, parents = self.attributes["joints"], self.attributes["joint_parents"]
+    def rotations(self) -> NDArray[np.float64]:
+        """Rotations [pose, joint, 3] of the whole dataset's poses, axis-angle in radians, over its named joints."""
+        joints = self.attributes["joints"]
         with self._damage():
-            rotations = self._small("pose/parameters", "float64", (self.grid.pose_count, len(joints), 3))
-        return Poses(tuple(joints), tuple(parents), rotations)
+            return read_array(self.group, "pose/parameters", "float64", (self.grid.pose_count, len(joints), 3))
 
     def vertex_count(self, identity: int) -> int:
         """Vertices of an identity's meshes."""
-        if identity not in self._counts:
-            with self._damage():
-                self._counts[identity] = self._vertex_count(identity)
-        return self._counts[identity]
+        return self._checked(self.arrays.row_of(identity)[0]).vertices
 
-    def _vertex_count(self, identity: int) -> int:
-        rows, size = len(self.grid.rows_of(identity)), self.grid.rows_per_shard(self.grid.split(identity))
-        count = read_vertex_count(self.group, identity, rows=rows, rows_per_shard=size)
-        first = f"{vertices_path(identity)}/c/0/0/0"
-        try:
-            require_plausible(12 * count * min(rows, size), stored=self._sizes.get(first, 0))
-        except ShardDamage as error:
-            raise ArrayDamage(f"{vertices_path(identity)}/zarr.json", f"meshes of {count} vertices: {error}") from error
-        return count
+    def _checked(self, array: GridArray) -> ShardCodec:
+        """How an array's shards are laid out, once its metadata were compared with it."""
+        if array.path not in self._codecs:
+            codec, first = codec_of(self.recipe, array), shard_path(array.place(0, 0))
+            with self._damage():
+                check_vertices(self.group, array, codec, stored=self.sizes.get(first, 0))
+            self._codecs[array.path] = codec
+        return self._codecs[array.path]
+
+    def check_axes(self, array: GridArray) -> None:
+        """Compare the numbers along the two axes of an array with the grid's (DatasetError where they differ)."""
+        for name, numbers in (("identity", array.identities), ("pose", array.poses)):
+            path = f"{array.path}/{name}"
+            with self._damage():
+                if not np.array_equal(read_array(self.group, path, "int32", numbers.shape), numbers):
+                    raise ArrayDamage(f"{path}/c/0", "other numbers than the grid's")
 
     @cached_property
-    def _counts(self) -> dict[int, int]:
+    def _codecs(self) -> dict[str, ShardCodec]:
         return {}
 
     @cached_property
-    def _topologies(self) -> dict[tuple[str, int], NDArray[np.int32]]:
+    def _topologies(self) -> dict[int, NDArray[np.int32]]:
+        return {}
+
+    @cached_property
+    def _parameters(self) -> dict[str, NDArray[np.float64]]:
+        return {}
+
+    @cached_property
+    def _indexes(self) -> dict[str, NDArray[np.uint64]]:
         return {}
 
     def vertices(self, identity: int, poses: int | Sequence[int] | NDArray[np.integer] | None = None) -> Meshes:
@@ -149,42 +166,52 @@ class Dataset:
         """
         if isinstance(poses, (int, np.integer)):
             return self.vertices(identity, [int(poses)])[0]
+        array, row = self.arrays.row_of(identity)
+        codec = self._checked(array)
         wanted = self.grid.poses_of(identity) if poses is None else poses
-        rows = np.array([self.grid.row_of(identity, int(pose)) for pose in wanted], np.int64)
-        codec = codec_of(self.recipe, self.grid.split(identity), vertices=self.vertex_count(identity))
-        meshes = np.empty((len(rows), codec.vertices, 3), np.float32)
-        for number in np.unique(rows // codec.rows):
-            places = np.flatnonzero(rows // codec.rows == number)
-            path = f"{vertices_path(identity)}/c/{number}/0/0"
-            meshes[places] = self._from_shard(path, codec, rows[places] % codec.rows)
+        columns = np.array([array.columns[int(pose)] for pose in wanted], np.int64)
+        band, first = divmod(row, codec.identities)
+        meshes = np.empty((len(columns), codec.vertices, 3), np.float32)
+        for number in np.unique(columns // codec.poses).tolist():
+            places = np.flatnonzero(columns // codec.poses == number)
+            rows = first * codec.poses + columns[places] % codec.poses
+            meshes[places] = self._from_shard(shard_path(array.place(band, number)), codec, rows)
         return meshes
 
     def _from_shard(self, path: str, codec: ShardCodec, rows: NDArray[np.int64]) -> Meshes:
         try:
-            if len(rows) * _WHOLE_FROM >= codec.rows:
-                return codec.decode(self._bytes(path), int(rows.max()) + 1)[rows]
-            return self._single_meshes(path, codec, rows)
+            if len(rows) * _TOGETHER_FROM >= codec.rows:
+                return codec.decode(self._bytes(path), rows)
+            index = self._index(path, codec)
+            if len(rows) * _TOGETHER_FROM >= codec.poses:
+                return self._run(path, codec, index, rows)
+            return np.concatenate([self._run(path, codec, index, rows[[place]]) for place in range(len(rows))])
         except ShardDamage as error:
+            self._indexes.pop(path, None)
             raise DatasetError(f"{self.url}: shard {path} is damaged: {error}. {self._mend}") from error
 
-    def _single_meshes(self, path: str, codec: ShardCodec, rows: NDArray[np.int64]) -> Meshes:
-        index = codec.decode_index(self._bytes(path, SuffixByteRequest(codec.index_bytes)))
-        meshes = np.empty((len(rows), codec.vertices, 3), np.float32)
-        for mesh, (offset, size) in zip(meshes, codec.places(index, rows.tolist()), strict=True):
-            codec.decode_mesh(self._bytes(path, RangeByteRequest(offset, offset + size)), mesh)
-        return meshes
+    def _run(self, path: str, codec: ShardCodec, index: NDArray[np.uint64], rows: NDArray[np.int64]) -> Meshes:
+        """Meshes of some rows, from the bytes between the first and the last of them, which are read at once."""
+        places = list(codec.places(index, rows))
+        start, end = min(offset for offset, _ in places), max(offset + size for offset, size in places)
+        return codec.decode_rows(self._bytes(path, RangeByteRequest(start, end)), index, rows, start=start)
+
+    def _index(self, path: str, codec: ShardCodec) -> NDArray[np.uint64]:
+        """The index of a shard, kept: a mesh that is read alone then takes one read."""
+        if path not in self._indexes:
+            if len(self._indexes) >= _MOST_INDEXES:
+                self._indexes.clear()
+            self._indexes[path] = codec.decode_index(self._bytes(path, SuffixByteRequest(codec.index_bytes)))
+        return self._indexes[path]
 
     def _bytes(self, path: str, byte_range: ByteRequest | None = None) -> bytes:
         try:
-            found = read_bytes(self.group, path, limit=self._sizes.get(path, 0), byte_range=byte_range)
+            found = read_bytes(self.group, path, limit=self.sizes.get(path, 0), byte_range=byte_range)
         except (OSError, UnsafeFileError) as error:
             raise DatasetError(f"{self.url}: shard {path} cannot be read ({reason_of(error)}). {self._mend}") from error
         if found is None:
             raise DatasetError(f"{self.url}: shard {path} is missing. {self._mend}")
         return found
-
-    def _small(self, path: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-        return read_array(self.group, path, dtype, shape, objects=self.committed.objects if self.committed else ())
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
@@ -200,7 +227,7 @@ class Dataset:
         path = f"evaluation/{pose_type}"
         most = [self.grid.identity_count, self.grid.pose_count] * 2
         with self._damage():
-            triples = self._small(path, "int32", (None, 4))
+            triples = read_array(self.group, path, "int32", (None, 4))
             if triples.size and not ((triples >= 0) & (triples < most)).all():
                 raise ArrayDamage(f"{path}/c/0/0", "a triple of identities or poses that are not there")
         return triples
@@ -208,6 +235,17 @@ class Dataset:
     @property
     def _mend(self) -> str:
         return f"Mend it: dsffnet verify {self.url} --repair"
+
+
+def damage_of(read: Callable[[], Any]) -> ArrayDamage | None:
+    """The damage of an array that a reading method of a dataset came to, None where there is none."""
+    try:
+        read()
+    except DatasetError as error:
+        if isinstance(error.__cause__, ArrayDamage):
+            return error.__cause__
+        raise
+    return None
 
 
 def open_dataset(url: str) -> Dataset:
@@ -244,11 +282,13 @@ def _quick_faults(dataset: Dataset) -> Iterator[str]:
         yield fault
     if dataset.committed is None:
         yield "its manifest is not the one that was committed"
-    elif not covers(dataset.committed, dataset.grid):
+    if damage := damage_of(lambda: dataset.arrays):
+        yield f"{damage.path} is missing or damaged ({damage.reason})"
+    elif dataset.committed and not covers(dataset.committed, dataset.arrays):
         yield "its manifest does not list the shards that its recipe has"
-    sizes = stored_sizes(dataset.group, [row.path for row in dataset.manifest])
-    for row in dataset.manifest:
-        if row.path not in sizes:
-            yield f"shard {row.path} is missing"
-        elif sizes[row.path] != row.bytes:
-            yield f"shard {row.path} has {sizes[row.path]} bytes instead of {row.bytes}"
+    sizes = stored_sizes(dataset.group, list(dataset.sizes))
+    for path, size in dataset.sizes.items():
+        if path not in sizes:
+            yield f"shard {path} is missing"
+        elif sizes[path] != size:
+            yield f"shard {path} has {sizes[path]} bytes instead of {size}"

@@ -10,92 +10,75 @@ import numpy as np
 import zarr
 
 from datagen.common.errors import DatasetError, UnsafeFileError, reason_of
-from datagen.grid import POSE_TYPES, SPLITS, Grid, Shard
+from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays, Shard
 from datagen.recipe import DatasetRecipe, MixedBody
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.attributes import attributes_fault
-from datagen.store.manifest import Manifest, changed_objects, covers, is_sealed, read_manifest
-from datagen.store.reader import Dataset
-from datagen.store.schema import (
-    ManifestRow,
-    attributes_of,
-    check_version,
-    open_group,
-    read_bytes,
-    shard_path,
-    stored_recipe,
-    stored_sizes,
-)
-from datagen.store.writer import existing_shard, stored_vertex_count
-
-Progress = Callable[[Iterable[Shard]], Iterable[Shard]]
+from datagen.store.manifest import Manifest, ManifestRow, changed_objects, covers, is_sealed, manifest_of, read_manifest
+from datagen.store.objects import read_bytes, stored_sizes
+from datagen.store.reader import Dataset, damage_of
+from datagen.store.schema import OLDEST_RECIPE, attributes_of, check_version, open_group, stored_recipe
+from datagen.store.writer import existing_shard
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something in a dataset that is not what it must be: where, why, and the shard to make again if it is one."""
+    """Something in a dataset that is not what it must be: where, why, and whether it is a shard."""
 
     path: str
     reason: str
-    shard: Shard | None = None
+    shard: bool = False
 
 
-def find_faults(url: str, *, progress: Progress = iter) -> Iterator[Fault]:
+Progress = Callable[[Iterable[Fault | None], int], Iterable[Fault | None]]
+"""Wraps the results of shards, of which there are so many."""
+
+
+def find_faults(url: str, *, progress: Progress = lambda shards, total: shards) -> Iterator[Fault]:
     """Check everything: each shard of the dataset's grid, then every other object, by the hashes of the manifest.
 
     Where a dataset is still being made there is no manifest; its shards are decoded instead.
     """
     group = open_group(url)
-    grid, manifest = Grid(require_recipe(url)), read_manifest(group) or Manifest()
-    rows = {row.path: row for row in manifest.shards}
-    for shard in progress(grid.shards()):
-        reason = _fault(group, grid, shard, rows.get(shard_path(shard)))
-        if reason:
-            yield Fault(shard_path(shard), reason, shard)
+    check_version(url, group)
+    dataset, manifest = Dataset(url, group), read_manifest(group) or manifest_of([], {})
+    arrays = _arrays(dataset)
+    total = arrays.shard_count if arrays else len(manifest.shards)
+    yield from filter(None, progress(_shard_faults(dataset, manifest, arrays), total))
     changed = [Fault(path, reason) for path, reason in changed_objects(group, manifest)]
     yield from changed
     if attributes_of(group).get("status") == "complete":
-        root = list(_root_faults(group, grid))
+        root = list(_root_faults(dataset))
         yield from root
         if not changed and not root:
-            yield from _misfits(Dataset(url, group))
+            yield from _misfits(dataset)
 
 
-def _root_faults(group: zarr.Group, grid: Grid) -> Iterator[Fault]:
-    if not is_sealed(group):
-        yield Fault("zarr.json", "its attributes are not as they were written")
-    elif reason := attributes_fault(group):
-        yield Fault("zarr.json", reason)
-    manifest = read_manifest(group)
-    if manifest is None or not covers(manifest, grid):
-        yield Fault("manifest/zarr.json", "not the manifest that was committed")
+def _shard_faults(dataset: Dataset, manifest: Manifest, arrays: GridArrays | None) -> Iterator[Fault | None]:
+    """The fault of every shard; which there are is known from the grid's arrays, or else from the manifest."""
+    rows = {row.place: row for row in manifest.shards}
+    if arrays is None:
+        reasons = ((row.path, _changed(dataset.group, row)) for row in manifest.shards)
+    else:
+        reasons = ((shard.path, _fault(dataset, shard, rows.get(shard.place))) for shard in arrays.shards())
+    for path, reason in reasons:
+        yield Fault(path, reason, shard=True) if reason else None
 
 
-def _misfits(dataset: Dataset) -> Iterator[Fault]:
-    """Arrays that are as they were committed, and yet not as the format has them."""
-    identities = range(dataset.grid.identity_count)
-    reads = [
-        dataset.poses,
-        *(partial(dataset.evaluation_triples, pose_type) for pose_type in POSE_TYPES),
-        *(partial(read, identity) for identity in identities for read in (dataset.faces, dataset.parameters)),
-    ]
-    found = (_damage_of(read) for read in reads)
-    yield from dict.fromkeys(Fault(damage.path, damage.reason) for damage in found if damage)
+def _fault(dataset: Dataset, shard: Shard, row: ManifestRow | None) -> str | None:
+    reason = _changed(dataset.group, row) if row else None
+    if reason or existing_shard(dataset.group, dataset.recipe, shard):
+        return reason
+    return "cannot be decoded" if row else "missing or damaged"
 
 
-def _damage_of(read: Callable[[], Any]) -> ArrayDamage | None:
-    try:
-        read()
-    except DatasetError as error:
-        if isinstance(error.__cause__, ArrayDamage):
-            return error.__cause__
-        raise
-    return None
+def _arrays(dataset: Dataset) -> GridArrays | None:
+    """The dataset's arrays of vertices; None where what says so is damaged, which is a fault of its own."""
+    return None if damage_of(lambda: dataset.arrays) else dataset.arrays
 
 
-def _fault(group: zarr.Group, grid: Grid, shard: Shard, row: ManifestRow | None) -> str | None:
-    if row is None:
-        return None if existing_shard(group, grid, shard) else "missing or damaged"
+def _changed(group: zarr.Group, row: ManifestRow) -> str | None:
+    """Why a shard is not as it was committed."""
     try:
         content = read_bytes(group, row.path, limit=row.bytes)
     except (OSError, UnsafeFileError) as error:
@@ -104,10 +87,30 @@ def _fault(group: zarr.Group, grid: Grid, shard: Shard, row: ManifestRow | None)
         return "missing"
     if len(content) != row.bytes:
         return f"{len(content)} bytes instead of {row.bytes}"
-    if hashlib.sha256(content).hexdigest() != row.sha256:
-        return "its sha256 is not the manifest's"
-    metadata_is_lost = stored_vertex_count(group, grid, shard.identity) is None  # a fault of its own
-    return None if metadata_is_lost or existing_shard(group, grid, shard) else "cannot be decoded"
+    return None if hashlib.sha256(content).hexdigest() == row.sha256 else "its sha256 is not the manifest's"
+
+
+def _root_faults(dataset: Dataset) -> Iterator[Fault]:
+    if not is_sealed(dataset.group):
+        yield Fault("zarr.json", "its attributes are not as they were written")
+    elif reason := attributes_fault(dataset.group):
+        yield Fault("zarr.json", reason)
+    arrays, manifest = _arrays(dataset), read_manifest(dataset.group)
+    if manifest is None or (arrays and not covers(manifest, arrays)):
+        yield Fault("manifest/zarr.json", "not the manifest that was committed")
+
+
+def _misfits(dataset: Dataset) -> Iterator[Fault]:
+    """Arrays that are as they were committed, and yet not as the format has them."""
+    reads: list[Callable[[], Any]] = [lambda: dataset.arrays, dataset.rotations]
+    reads += [partial(dataset.evaluation_triples, pose_type) for pose_type in POSE_TYPES]
+    arrays = _arrays(dataset)
+    for array in arrays.arrays if arrays else ():
+        first = int(array.identities[0])
+        reads += [partial(read, first) for read in (dataset.faces, dataset.parameters, dataset.vertex_count)]
+        reads.append(partial(dataset.check_axes, array))
+    found = (damage_of(read) for read in reads)
+    yield from dict.fromkeys(Fault(damage.path, damage.reason) for damage in found if damage)
 
 
 def describe(url: str) -> dict[str, Any]:
@@ -118,9 +121,9 @@ def describe(url: str) -> dict[str, Any]:
     if fault:
         raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
     attributes, recipe = attributes_of(group), stored_recipe(url, group)
-    grid = Grid(recipe)
-    shards = grid.shards()
-    sizes = stored_sizes(group, [shard_path(shard) for shard in shards])
+    grid, arrays = Grid(recipe), _arrays(Dataset(url, group))
+    shards = arrays.shards() if arrays else []
+    sizes = stored_sizes(group, [shard.path for shard in shards])
     facts = {
         "dataset": url,
         "status": attributes["status"],
@@ -130,7 +133,7 @@ def describe(url: str) -> dict[str, Any]:
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
         f"({recipe.poses.distribution.name}, {len(attributes['joints'])} joints)",
         "appended": _growth(recipe),
-        "meshes": f"{grid.mesh_count:,} of {_vertex_counts(group, grid)} vertices",
+        "meshes": f"{grid.mesh_count:,} of {_vertex_counts(arrays)} vertices",
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
         "extent": _extent(attributes),
         "evaluation triples": ", ".join(f"{_triples(group, kind)} {kind}" for kind in POSE_TYPES),
@@ -192,16 +195,21 @@ def _kind(recipe: DatasetRecipe) -> str:
     return next((word if isinstance(word, str) else ", ".join(word) for word in words if word), "")
 
 
-def _vertex_counts(group: zarr.Group, grid: Grid) -> str:
-    found = {stored_vertex_count(group, grid, identity) for identity in range(grid.identity_count)}
-    counts = sorted(count for count in found if count)
-    if not counts:
+def _vertex_counts(arrays: GridArrays | None) -> str:
+    if arrays is None:
         return "unknown"
+    counts = sorted({array.vertices for array in arrays.arrays})
     return f"{counts[0]:,}" if len(counts) == 1 else f"{counts[0]:,} to {counts[-1]:,}"
 
 
 def require_recipe(url: str) -> DatasetRecipe:
-    """The recipe stored with a dataset of any status (DatasetError where there is none that can be read)."""
+    """The recipe stored with a dataset of any status, also of an older format: it makes the dataset anew.
+
+    Raises
+    ------
+    DatasetError
+        There is none that can be read.
+    """
     group = open_group(url)
-    check_version(url, group)
+    check_version(url, group, oldest=OLDEST_RECIPE)
     return stored_recipe(url, group)

@@ -1,61 +1,103 @@
 """Writing a dataset: begin (metadata, idempotent), one whole shard at a time, finish (manifest and status last).
 
-Every step can be repeated after any interruption and leaves the same bytes: arrays are created only where they are
-missing, a shard is written once and whole by one task, and ``status: complete`` is the very last write.
+Every step can be repeated after any interruption and leaves the same bytes: small arrays are written only where they
+are not there yet, a shard is written once and whole by one task, and ``status: complete`` is the very last write.
 """
 
 import contextlib
-import hashlib
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import ZstdCodec
-from zarr.errors import ContainsArrayError
 
-from datagen.bodies import BodyModel
 from datagen.common.errors import DatasetError, NoDataset, ShardDamage, UnsafeFileError, storage_errors
-from datagen.common.seeding import Stream, generator
-from datagen.grid import Grid, Shard
-from datagen.importers import evaluation_lists
-from datagen.mesh.geometry import bounds
-from datagen.poses import draw_poses
+from datagen.grid import HOLE, GridArray, GridArrays, PoseType, Shard
 from datagen.recipe import DatasetRecipe
-from datagen.store.arrays import ArrayDamage, read_array, read_vertex_count, read_vertices_shape
-from datagen.store.attributes import assets_of, check_same_assets, check_same_recipe, provenance, stated
-from datagen.store.codec import ShardCodec
-from datagen.store.manifest import Manifest, commit, read_manifest
+from datagen.store.arrays import put_array, put_group, put_vertices_metadata
+from datagen.store.attributes import check_same_assets, check_same_recipe, with_history
+from datagen.store.manifest import ManifestRow, commit, read_manifest, row_of
+from datagen.store.object_names import MEMBERS
+from datagen.store.objects import delete_object, list_objects, read_bytes, stored_sizes, write_bytes
 from datagen.store.schema import (
-    ManifestRow,
+    FORMAT_VERSION,
     attributes_of,
     check_extent,
+    check_shards,
     codec_of,
     create_group,
-    create_vertices_array,
-    delete_object,
-    identity_name,
-    list_objects,
     open_group,
-    read_bytes,
-    require_group,
-    shard_path,
-    stored_sizes,
-    vertices_path,
-    write_bytes,
 )
 
-_GROUPS = ("topology", "identity", "pose", "evaluation", "manifest")
+SmallArray = tuple[str, NDArray[Any], tuple[str, ...]]
+"""Path, values and dimension names."""
 
 
-def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
-    """Parameters [parameter] of identity number ``identity``, a function of (seed, identity) alone."""
-    return body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, identity), identity)
+@dataclass(frozen=True)
+class Plan:
+    """Everything of a dataset but the vertices of its shards.
+
+    Attributes
+    ----------
+    attributes
+        What the root says of the dataset, see docs/dataset-format.md.
+    provenance
+        What makes it, here and now.
+    arrays
+        Where its meshes go.
+    parameters
+        Of the body model, float64 [identity, parameter].
+    faces
+        Triangles int32 [face, 3] of each topology.
+    poses
+        Axis-angle rotations in radians, float64 [pose, joint, 3].
+    triples
+        Evaluation triples int32 [triple, 4] of each pose type.
+    """
+
+    attributes: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    arrays: GridArrays
+    parameters: NDArray[np.float64]
+    faces: Sequence[NDArray[np.int32]]
+    poses: NDArray[np.float64]
+    triples: Mapping[PoseType, NDArray[np.int32]]
+
+    @property
+    def recipe(self) -> DatasetRecipe:
+        """The recipe that it was made from."""
+        return self.arrays.grid.recipe
+
+    def small_arrays(self) -> Iterator[SmallArray]:
+        """All arrays but those of vertices."""
+        yield "grid/topology", self.arrays.topologies, ("identity",)
+        yield "topology/vertex_count", np.array(self.arrays.vertices, np.int32), ("topology",)
+        for topology, faces in enumerate(self.faces):
+            yield f"topology/{topology}/faces", faces, ("face", "corner")
+        yield "pose/parameters", self.poses, ("pose", "joint", "axis")
+        for pose_type, triples in self.triples.items():
+            yield f"evaluation/{pose_type}", triples, ("triple", "column")
+        for array in self.arrays.arrays:
+            yield from self._axes(array)
+
+    def _axes(self, array: GridArray) -> Iterator[SmallArray]:
+        parameters = np.where((array.identities == HOLE)[:, None], np.nan, self.parameters[array.identities])
+        yield f"{array.path}/identity", array.identities, ("identity",)
+        yield f"{array.path}/pose", array.poses, ("pose",)
+        yield f"{array.path}/parameters", parameters, ("identity", "parameter")
 
 
-def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
+def begin(url: str, plan: Plan, *, growing: bool = False, lost: Sequence[str] = ()) -> None:
     """Create the dataset, or whatever an interrupted ``begin`` left out of it.
+
+    Parameters
+    ----------
+    growing
+        A complete dataset is there, of the recipe before its last step: from here on it is one in the making.
+    lost
+        Objects other than shards that were lost or changed, to be made again.
 
     Raises
     ------
@@ -63,49 +105,46 @@ def begin(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
         A dataset of another recipe, other assets or another version is there already, or something else is.
     """
     with _writing(url):
-        check_extent(url, recipe)
-        wanted = stated(recipe, body)
-        try:
-            group = open_group(url, mode="r+")
-        except NoDataset:
-            group = create_group(url, {**wanted, "status": "building", "provenance": provenance(None)})
-        check_same_recipe(url, group, recipe)
-        check_same_assets(url, group, assets_of(recipe, body))
-        _restate(group, wanted)
-        _create_arrays(group, recipe, body)
+        check_extent(url, plan.recipe)
+        check_shards(url, plan.recipe, plan.arrays.shard_count)
+        wanted = {**plan.attributes, "format_version": FORMAT_VERSION}
+        group = _opened(url, {**wanted, "status": "building", "provenance": dict(plan.provenance)}, growing=growing)
+        growth = plan.recipe.growth
+        before = plan.recipe.model_copy(update={"growth": growth[:-1]}) if growing else plan.recipe
+        check_same_recipe(url, group, before)
+        if not lost:
+            check_same_assets(url, group, plan.attributes["body"]["assets"])
+        present = attributes_of(group)
+        if growing or lost:
+            made_by = with_history(plan.provenance, present.get("provenance"))
+            group.update_attributes({**wanted, "status": "building", "provenance": made_by})
+        elif {key: present.get(key) for key in wanted} != wanted:
+            group.update_attributes(wanted)
+        for path in lost:
+            if path != "zarr.json":
+                delete_object(group, path)
+        _put_arrays(group, plan)
 
 
-def grow(url: str, recipe: DatasetRecipe, body: BodyModel) -> None:
-    """Give a complete dataset a recipe that has grown by one step: from here on it is a dataset in the making.
-
-    Raises
-    ------
-    DatasetError
-        The dataset is not the one that the recipe grew from.
-    """
-    with _writing(url):
-        group = open_group(url, mode="r+")
-        check_same_recipe(url, group, recipe.model_copy(update={"growth": recipe.growth[:-1]}))
-        check_same_assets(url, group, assets_of(recipe, body))
-        made_by = provenance(attributes_of(group).get("provenance"))
-        group.update_attributes({**stated(recipe, body), "status": "building", "provenance": made_by})
+def _opened(url: str, attributes: dict[str, Any], *, growing: bool) -> zarr.Group:
+    try:
+        return open_group(url, mode="r+")
+    except NoDataset:
+        if growing:
+            raise
+        return create_group(url, attributes)
 
 
-def restate(url: str, recipe: DatasetRecipe, body: BodyModel, objects: Sequence[str]) -> None:
-    """Write the root's attributes anew and remove other objects that were lost or changed: ``begin`` makes them."""
-    with _writing(url):
-        group = open_group(url, mode="r+")
-        check_same_recipe(url, group, recipe)
-        made_by = provenance(attributes_of(group).get("provenance"))
-        group.update_attributes({**stated(recipe, body), "status": "building", "provenance": made_by})
-        for path in objects:
-            delete_object(group, path)
-
-
-def _restate(group: zarr.Group, wanted: dict[str, Any]) -> None:
-    present = attributes_of(group)
-    if {key: present.get(key) for key in wanted} != wanted:
-        group.update_attributes(wanted)
+def _put_arrays(group: zarr.Group, plan: Plan) -> None:
+    groups = {path.rpartition("/")[0] for path, _, _ in plan.small_arrays()}
+    splits = {f"grid/{array.split}" for array in plan.arrays.arrays}
+    topologies = {f"topology/{number}" for number in range(len(plan.faces))}
+    for path in sorted({*MEMBERS, *groups, *splits, *topologies} - {"manifest"}):
+        put_group(group, path)
+    for path, values, dimensions in plan.small_arrays():
+        put_array(group, path, values, dimensions)
+    for array in plan.arrays.arrays:
+        put_vertices_metadata(group, array, codec_of(plan.recipe, array))
 
 
 def require_driven(url: str, recipe: DatasetRecipe) -> zarr.Group:
@@ -125,7 +164,7 @@ def require_driven(url: str, recipe: DatasetRecipe) -> zarr.Group:
 def write_shard(
     url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32], *, committed: str | None = None
 ) -> ManifestRow:
-    """Write one whole shard, vertices [rows, vertex, 3], and return its manifest row.
+    """Write one whole shard, vertices [identity, pose, vertex, 3], and return its manifest row.
 
     Raises
     ------
@@ -133,63 +172,33 @@ def write_shard(
         The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its array's
         shape; nothing is written then.
     """
-    path, group, grid = shard_path(shard), require_driven(url, recipe), Grid(recipe)
-    count = stored_vertex_count(group, grid, shard.identity)
-    if count is None or vertices.shape != (shard.rows, count, 3):
-        expected = [shard.rows, count, 3]
-        raise DatasetError(f"{url}: shard {path} came out of shape {list(vertices.shape)} instead of {expected}")
-    codec = codec_of(recipe, grid.split(shard.identity), vertices=count)
-    content = codec.encode(vertices)
-    row = _row(shard, content, vertices)
+    group, expected = require_driven(url, recipe), (len(shard.identities), len(shard.poses), shard.vertices, 3)
+    if vertices.shape != expected:
+        raise DatasetError(f"{url}: shard {shard.path} came out of shape {vertices.shape} instead of {expected}")
+    content = codec_of(recipe, shard).encode(vertices)
+    row = row_of(shard, content, vertices)
     if committed not in (None, row.sha256):
         raise DatasetError(
-            f"{url}: shard {path} was made again, but not the same: other package versions made it "
+            f"{url}: shard {shard.path} was made again, but not the same: other package versions made it "
             f"(dsffnet inspect {url} names them). Install those, or make the dataset anew with --fresh"
         )
     with _writing(url):
-        write_bytes(group, path, content)
-        if stored_sizes(group, [path]) != {path: len(content)}:
-            raise DatasetError(f"{url}: shard {path} is not there as it was written; is the storage sound?")
+        write_bytes(group, shard.path, content)
+        if stored_sizes(group, [shard.path]) != {shard.path: len(content)}:
+            raise DatasetError(f"{url}: shard {shard.path} is not there as it was written; is the storage sound?")
     return row
 
 
-def existing_shard(group: zarr.Group, grid: Grid, shard: Shard) -> ManifestRow | None:
+def existing_shard(group: zarr.Group, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:
     """The manifest row of a shard that is there, whole and sound; None where it is missing, damaged or unreadable."""
-    count = stored_vertex_count(group, grid, shard.identity)
-    if count is None:
-        return None
-    codec = codec_of(grid.recipe, grid.split(shard.identity), vertices=count)
+    codec = codec_of(recipe, shard)
     try:
-        content = read_bytes(group, shard_path(shard), limit=codec.most_bytes)
-        return None if content is None else _row(shard, content, codec.decode(content, shard.rows))
+        content = read_bytes(group, shard.path, limit=codec.most_bytes)
+        if content is None:
+            return None
+        return row_of(shard, content, codec.decode(content, codec.rows_of(len(shard.identities), len(shard.poses))))
     except (ShardDamage, OSError, UnsafeFileError):
         return None
-
-
-def stored_vertex_count(group: zarr.Group, grid: Grid, identity: int) -> int | None:
-    """Vertices of an identity's meshes; None where its array has no metadata that makes sense."""
-    size = grid.rows_per_shard(grid.split(identity))
-    try:
-        return read_vertex_count(group, identity, rows=None, rows_per_shard=size)
-    except ArrayDamage:
-        return None
-
-
-def _row(shard: Shard, content: bytes, vertices: NDArray[np.float32]) -> ManifestRow:
-    low, high = bounds(vertices)
-    return ManifestRow(
-        path=shard_path(shard),
-        rows=shard.rows,
-        sha256=hashlib.sha256(content).hexdigest(),
-        bytes=len(content),
-        minimum=_triple(low.min(axis=0)),
-        maximum=_triple(high.max(axis=0)),
-    )
-
-
-def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
-    x, y, z = map(float, values)
-    return x, y, z
 
 
 def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
@@ -221,76 +230,10 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
 def committed_hashes(url: str) -> dict[str, str]:
     """The sha256 of each shard that a dataset's manifest has, by path; empty where there is none."""
     try:
-        manifest = read_manifest(open_group(url)) or Manifest()
+        manifest = read_manifest(open_group(url))
     except NoDataset:
         return {}
-    return {row.path: row.sha256 for row in manifest.shards}
-
-
-def _create_arrays(group: zarr.Group, recipe: DatasetRecipe, body: BodyModel) -> None:
-    grid = Grid(recipe)
-    for name in _GROUPS:
-        require_group(group, name)
-    poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
-    _put(group, "pose/parameters", poses, ("pose", "joint", "axis"))
-    for pose_type, triples in evaluation_lists(grid).items():
-        _put(group, f"evaluation/{pose_type}", triples, ("triple", "column"))
-    topologies: dict[bytes, str] = {}
-    for identity in range(grid.identity_count):
-        parameters = identity_parameters(recipe, body, identity)
-        faces = body.faces(parameters)
-        topology = topologies.setdefault(faces.tobytes(), str(len(topologies)))
-        require_group(group, f"topology/{topology}")
-        _put(group, f"topology/{topology}/faces", faces, ("face", "corner"))
-        one_pose = draw_poses(recipe.poses, grid.poses_of(identity)[:1])
-        vertices = body.vertices(parameters, one_pose).shape[1]  # not faces.max() + 1: some vertices may be in no face
-        _create_identity(group, grid, identity, parameters, vertices, topology)
-
-
-def _create_identity(
-    group: zarr.Group, grid: Grid, identity: int, parameters: NDArray[np.float64], vertices: int, topology: str
-) -> None:
-    home, rows, path = f"identity/{identity_name(identity)}", grid.rows_of(identity), vertices_path(identity)
-    _put(group, f"{home}/parameters", parameters, ("parameter",))
-    _put(group, f"{home}/pose", rows.astype(np.int32), ("row",))
-    codec = codec_of(grid.recipe, grid.split(identity), vertices=vertices)
-    if _vertices_shape(group, identity, codec) != (len(rows), vertices, 3):
-        delete_object(group, f"{path}/zarr.json")  # of an array that has grown, or a damaged one: no shard is touched
-        with contextlib.suppress(ContainsArrayError):  # on a store without a lock, somebody else was first
-            create_vertices_array(group, path, rows=len(rows), codec=codec)
-    require_group(group, home).update_attributes({"topology": topology, "split": grid.split(identity)})
-
-
-def _vertices_shape(group: zarr.Group, identity: int, codec: ShardCodec) -> tuple[int, ...] | None:
-    try:
-        return read_vertices_shape(group, identity, rows_per_shard=codec.rows)
-    except ArrayDamage:
-        return None
-
-
-def _put(group: zarr.Group, path: str, values: NDArray[Any], dimensions: tuple[str, ...]) -> None:
-    """Store a small array in one chunk with a checksum, unless it is there and holds these values already."""
-    if _holds(group, path, values):
-        return
-    for name in ("zarr.json", "/".join(["c", *"0" * values.ndim])):
-        delete_object(group, f"{path}/{name}")
-    with contextlib.suppress(ContainsArrayError):  # on a store without a lock, somebody else was first
-        group.create_array(
-            path,
-            shape=values.shape,
-            dtype=values.dtype,
-            chunks=tuple(max(1, size) for size in values.shape),
-            compressors=ZstdCodec(level=3, checksum=True),
-            dimension_names=dimensions,
-        )
-    cast(zarr.Array[Any], group[path])[...] = values
-
-
-def _holds(group: zarr.Group, path: str, values: NDArray[Any]) -> bool:
-    try:
-        return np.array_equal(read_array(group, path, values.dtype.name, values.shape), values)
-    except ArrayDamage:
-        return False
+    return {row.path: row.sha256 for row in manifest.shards} if manifest else {}
 
 
 def _writing(url: str) -> contextlib.AbstractContextManager[None]:

@@ -18,7 +18,8 @@ from datagen.common.errors import DatasetError
 from datagen.generate import append, generate, repair
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
-from datagen.store.schema import open_group, read_bytes, shard_path, write_bytes
+from datagen.store.objects import read_bytes, write_bytes
+from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
 from tests.support.ranks import free_port
@@ -44,7 +45,7 @@ def many_shards() -> DatasetRecipe:
 
 
 def shard_count(url: Path) -> int:
-    return len(list(url.rglob("vertices/c/*/0/0")))
+    return len(list(url.rglob("vertices/c/*/*/0/0")))
 
 
 def wait_for(condition: object, *, seconds: float = 150) -> None:
@@ -189,7 +190,7 @@ def test_faults_on_s3_are_found_and_mended(bucket: str, dataset: str) -> None:
     url = f"{bucket}/faulty.zarr"
     generate(tiny_dataset(), url)
     whole, group = objects(url), open_group(url, mode="r+")
-    path = "identity/0001/vertices/c/1/0/0"
+    path = "grid/training/0/vertices/c/1/1/0/0"
     content = bytearray(read_bytes(group, path) or b"")
     content[len(content) // 2] ^= 1
     write_bytes(group, path, bytes(content))
@@ -209,7 +210,7 @@ def test_growing_and_removing_on_s3(bucket: str, tmp_path: Path) -> None:
     assert grown.uuid == local.uuid
     assert objects(url).keys() == {str(p.relative_to(local.url)) for p in Path(local.url).rglob("*") if p.is_file()}
     again = generate(tiny_dataset(), url, fresh=True)
-    assert again.recipe == tiny_dataset() and shard_path(grown.grid.shards()[-1]) not in objects(url)
+    assert again.recipe == tiny_dataset() and grown.arrays.shards()[-1].path not in objects(url)
 
 
 def test_two_generators_on_one_s3_dataset_do_no_harm(bucket: str, dataset: str) -> None:

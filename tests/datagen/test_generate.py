@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 
 from datagen import generate as generation
 from datagen.common.errors import BodyError, DatasetError
-from datagen.generate import generate, inline, make_shard, prepare
-from datagen.grid import Grid
+from datagen.generate import generate, inline, make_shard, prepare, shards
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import shards_of, tiny_dataset
 
 
 class Interrupted(Exception):
@@ -50,7 +49,7 @@ def interrupted_runner(order: list[int], stop_after: int) -> generation.Runner:
 def test_any_order_and_any_interruption_give_the_same_bytes(
     dataset: str, tmp_path_factory: pytest.TempPathFactory, order: list[int], stop_after: int, again: int
 ) -> None:
-    assert len(Grid(tiny_dataset()).shards()) == 12
+    assert len(shards_of(tiny_dataset())) == 12
     url = str(tmp_path_factory.mktemp("interrupted") / "leg.zarr")
     for stop in (stop_after, again):
         with pytest.raises(Interrupted):
@@ -66,10 +65,10 @@ def test_an_existing_shard_is_not_made_again(spoilable: Path, monkeypatch: pytes
 
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
     made: list[Any] = []
-    monkeypatch.setattr(generation, "make_shard", lambda recipe, shard: made.append(shard) or make_shard(recipe, shard))
-    (spoilable / "identity/0001/vertices/c/1/0/0").unlink()
+    monkeypatch.setattr(shards, "make_shard", lambda recipe, shard: made.append(shard) or make_shard(recipe, shard))
+    (spoilable / "grid/training/0/vertices/c/1/1/0/0").unlink()
     generate(tiny_dataset(), str(spoilable))
-    assert [(shard.identity, shard.number) for shard in made] == [(1, 1)]
+    assert [(shard.identities, shard.poses) for shard in made] == [((1,), range(4, 6))]
 
 
 def test_two_generators_on_one_dataset(tmp_path: Path) -> None:
@@ -83,12 +82,12 @@ def test_sigkill_while_writing(dataset: str, tmp_path: Path) -> None:
     """Killed at several moments, then finished by the same command: the undisturbed bytes."""
     url = tmp_path / "leg.zarr"
     code = (
-        "from datagen.generate import generate; from tests.support.recipes import tiny_dataset; import sys;"
+        "from datagen.generate import generate; from tests.support.recipes import shards_of, tiny_dataset; import sys;"
         "generate(tiny_dataset(), sys.argv[1])"
     )
     for shards_before_kill in (1, 3, 6):
         process = subprocess.Popen([sys.executable, "-c", code, str(url)], cwd=Path(__file__).parents[2])
-        while process.poll() is None and len(list(url.rglob("vertices/c/*/0/0"))) < shards_before_kill:
+        while process.poll() is None and len(list(url.rglob("vertices/c/*/*/0/0"))) < shards_before_kill:
             time.sleep(0.002)
         assert process.poll() is None, "it ended before it could be killed"
         os.kill(process.pid, signal.SIGKILL)
@@ -143,5 +142,5 @@ def test_a_body_that_gives_a_point(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_more_identities_leave_the_first_ones_as_they_were() -> None:
     small, large = tiny_dataset(), tiny_dataset(identities={"training": 5, "evaluation": 2})
     for number in (0, 2):
-        small_shard, large_shard = (Grid(recipe).shards()[number * 2] for recipe in (small, large))
+        small_shard, large_shard = (shards_of(recipe)[number * 2] for recipe in (small, large))
         assert np.array_equal(make_shard(small, small_shard), make_shard(large, large_shard))

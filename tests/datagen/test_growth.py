@@ -17,7 +17,7 @@ from tests.support.recipes import tiny_dataset
 
 
 def shard_files(url: Path) -> dict[str, int]:
-    return {str(path.relative_to(url)): path.stat().st_mtime_ns for path in url.rglob("vertices/c/*/0/0")}
+    return {str(path.relative_to(url)): path.stat().st_mtime_ns for path in url.rglob("vertices/c/*/*/0/0")}
 
 
 GROWTH: list[dict[str, int]] = [

@@ -13,7 +13,7 @@ from datagen import sizes
 from datagen.common.errors import DatasetError, OutOfMemory, RecipeError, StorageError
 from datagen.common.resources import bytes_text, memory_errors, ran_out_of_memory
 from datagen.generate import append, generate
-from datagen.grid import Grid
+from datagen.grid import Grid, GridArrays
 from datagen.recipe import AnnyBody, DatasetRecipe, MixedBody
 from datagen.sizes import duration_text, require_disk, require_memory, size_of
 from datagen.store import open_dataset
@@ -38,7 +38,7 @@ def test_counts_without_lists_are_those_of_the_lists(
             growth=growth,
         )
     )
-    shards = grid.shards()
+    shards = GridArrays(grid, [0] * grid.identity_count, [32]).shards()
     assert grid.shard_count == len(shards)
     assert grid.mesh_count == sum(shard.rows for shard in shards)
     assert grid.identity_count == len({*grid.identities("training"), *grid.identities("evaluation")})
@@ -53,10 +53,6 @@ HUGE: dict[str, tuple[dict[str, Any], str]] = {
     "a part of a mixed body": (
         {"body": {"family": "mixed", "bodies": [{"family": "leg"}, {"family": "leg", "segments": 10**12}]}},
         "Lower the body's vertices",
-    ),
-    "shards": (
-        {"poses": {"seen": 10**6}, "body": {"family": "leg", "rings": 10**5}, "store": {"poses_per_shard": 10**6}},
-        "Lower data.store.poses_per_shard",
     ),
     "everything": ({"identities": {"training": 2**63 - 1}, "poses": {"seen": 2**63 - 1}}, "Lower data.identities"),
     "what was appended": ({"growth": [{"seen": 10**11}]}, "Lower data.poses"),
@@ -91,9 +87,9 @@ def test_appending_beyond_memory_is_refused_and_the_dataset_stays_whole(spoilabl
 
 def test_what_the_format_cannot_hold_is_refused_before_poses_are_drawn(tmp_path: Path, spoilable: Path) -> None:
     many = 2_000_000  # a gigabyte of memory, and minutes of drawing
-    with pytest.raises(DatasetError, match="A dataset holds up to 1,000,000 poses"):
+    with pytest.raises(DatasetError, match=r"A dataset holds up to .* 1,000,000 poses"):
         generate(tiny_dataset(poses={"seen": many}), str(tmp_path / "x.zarr"))
-    with pytest.raises(DatasetError, match="A dataset holds up to 1,000,000 poses"):
+    with pytest.raises(DatasetError, match=r"A dataset holds up to .* 1,000,000 poses"):
         append(str(spoilable), seen=many)
     assert open_dataset(str(spoilable)).grid.pose_count == 10
 

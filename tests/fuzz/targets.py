@@ -66,7 +66,7 @@ def _whole_dataset(tree: Path) -> str:
     from datagen.store import open_dataset
 
     dataset = open_dataset(str(tree))
-    parts: list[object] = [dataset.uuid, dataset.poses().rotations]
+    parts: list[object] = [dataset.uuid, dataset.rotations()]
     for identity in range(dataset.grid.identity_count):
         parts += [dataset.faces(identity), dataset.parameters(identity), dataset.vertices(identity)]
     return _digest([*parts, *map(dataset.evaluation_triples, ("seen", "unseen"))])

@@ -9,13 +9,12 @@ _KEPT = ("shape", "data_type", "chunk_grid", "codecs", "fill_value", "dimension_
 
 
 def layout(url: str) -> dict[str, Any]:
-    """Attributes' names of the root, and for each array its metadata; identities beyond the first are left out."""
+    """Attributes' names of the root, and for each array its metadata."""
     root = Path(url)
     found: dict[str, Any] = {"attributes": sorted(json.loads((root / "zarr.json").read_text())["attributes"])}
     for path in sorted(root.rglob("zarr.json")):
         name, metadata = str(path.parent.relative_to(root)), json.loads(path.read_text())
-        is_repeat = name.startswith("identity/") and "/0000" not in f"/{name}"
-        if metadata["node_type"] == "array" and not is_repeat:
+        if metadata["node_type"] == "array":
             found[name] = {key: metadata[key] for key in _KEPT}
     return found
 

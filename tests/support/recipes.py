@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from datagen.generate.plan import plan_of
+from datagen.grid import Shard
 from datagen.recipe import DatasetRecipe
 from training.recipes.training import TrainingRecipe
 
@@ -16,6 +18,11 @@ def tiny_dataset(**changes: Any) -> DatasetRecipe:
         "store": {"poses_per_shard": 4},
     }
     return DatasetRecipe.model_validate(values | changes)
+
+
+def shards_of(recipe: DatasetRecipe) -> list[Shard]:
+    """All shards of a recipe's dataset."""
+    return plan_of(recipe).arrays.shards()
 
 
 def tiny_training(**changes: Any) -> TrainingRecipe:

@@ -39,7 +39,7 @@ class Layout:
     starts
         Place of each mesh' first vertex [mesh] int64.
     shards
-        A number for the shard that each mesh is in [mesh] int64, ascending.
+        A number for the part of a shard that each mesh is in [mesh] int64, ascending; a part is of one identity.
     """
 
     def __init__(self, dataset: Dataset, identities: Sequence[int]) -> None:
@@ -54,24 +54,21 @@ class Layout:
         self._index[list(self.identities)] = np.arange(len(self.identities))
         self._split = np.array([SPLITS.index(grid.split(identity)) for identity in self.identities])
         self._place = np.stack([self._places_in(split) for split in SPLITS])
-        within = [self._shards_in(grid.split(identity)) for identity in self.identities]
+        within = [self._shards_of(identity) for identity in self.identities]
         self.shards = self._owner * (1 + max(shards[-1] for shards in within)) + np.concatenate(within)
-
-    def _rows_in(self, split: Split) -> NDArray[np.int64]:
-        """The pose of each row of a split's identities, as :meth:`datagen.grid.Grid.rows_of` has it."""
-        members = self.dataset.grid.identities(split)
-        return self.dataset.grid.rows_of(members[0]) if members else np.empty(0, np.int64)
 
     def _places_in(self, split: Split) -> NDArray[np.int64]:
         """Place of every pose among those of a split's identities; -1 where they were not made in it."""
-        places, rows = np.full(self.dataset.grid.pose_count, -1), self._rows_in(split)
-        poses = rows[rows != HOLE]
+        grid = self.dataset.grid
+        places, members = np.full(grid.pose_count, -1), grid.identities(split)
+        poses = grid.poses_of(members[0]) if members else np.empty(0, np.int64)
         places[poses] = np.arange(len(poses))
         return places
 
-    def _shards_in(self, split: Split) -> NDArray[np.int64]:
-        """The shard of each mesh of an identity of a split."""
-        return np.flatnonzero(self._rows_in(split) != HOLE) // self.dataset.grid.rows_per_shard(split)
+    def _shards_of(self, identity: int) -> NDArray[np.int64]:
+        """The shard of each mesh of an identity, numbered along its poses."""
+        array, _ = self.dataset.arrays.row_of(identity)
+        return np.flatnonzero(array.poses != HOLE) // array.room[1]
 
     @property
     def vertices(self) -> int:

@@ -1,7 +1,7 @@
 """The subcommands of ``dsffnet`` that make, show, check, take in and give out data."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -163,16 +163,16 @@ def verify_command(options: argparse.Namespace) -> None:
       dsffnet verify data/quickstart.zarr --repair
     """
     from datagen.generate import inline, repair
-    from datagen.grid import Grid
-    from datagen.store.verify import find_faults
+    from datagen.store.verify import Fault, find_faults
     from workflows.pipeline.generate import generation_bar, is_complete
     from workflows.pipeline.progress import bar
 
     recipe = _own_recipe(options.dataset, options.set)
-    count = Grid(recipe).shard_count
-    faults = list(
-        find_faults(options.dataset, progress=lambda shards: bar(shards, total=count, what="verify", unit="shard"))
-    )
+
+    def shown(shards: Iterable[Fault | None], total: int) -> Iterable[Fault | None]:
+        return bar(shards, total=total, what="verify", unit="shard")
+
+    faults = list(find_faults(options.dataset, progress=shown))
     for fault in faults:
         print_text(printable(f"fault: {fault.path}: {fault.reason}"))
     complete = is_complete(options.dataset)
@@ -195,9 +195,11 @@ def _own_recipe(url: str, overrides: Sequence[str]) -> "DatasetRecipe":
         Something else than a path is changed.
     """
     from datagen.recipe import PATH_KEYS
+    from datagen.store.schema import check_version, open_group
     from datagen.store.verify import require_recipe
     from workflows.recipe.loader import change_recipe
 
+    check_version(url, open_group(url))
     stored = require_recipe(url)
     recipe = change_recipe({"data": stored.model_dump(mode="json")}, overrides, where=url).data
     if recipe.sha256() != stored.sha256():

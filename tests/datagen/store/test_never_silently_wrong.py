@@ -10,16 +10,17 @@ import pytest
 
 from datagen.bodies.leg import LegModel
 from datagen.common.assets import Asset
-from datagen.common.errors import DatasetError
+from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import append, ensure_shard, generate, make_shard, repair
-from datagen.grid import Grid
+from datagen.generate.plan import plan_of
+from datagen.generate.shards import require_same_assets
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
-from datagen.store.schema import open_group, shard_path
+from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from datagen.store.writer import write_shard
 from tests.support.files import tree_hash
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import shards_of, tiny_dataset
 from tests.support.shapes.meshes import npt_folder
 
 OTHER = tiny_dataset(identities={"training": 3, "evaluation": 2, "seed": 5})
@@ -44,9 +45,9 @@ def test_vertices_that_are_in_no_face_are_kept(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_shard_of_another_shape_is_not_written(spoilable: Path) -> None:
-    shard, before = Grid(tiny_dataset()).shards()[0], tree_hash(spoilable)
-    with pytest.raises(DatasetError, match=r"of shape \[4, 31, 3\] instead of \[4, 32, 3\]"):
-        write_shard(str(spoilable), tiny_dataset(), shard, np.zeros((4, 31, 3), np.float32))
+    shard, before = shards_of(tiny_dataset())[0], tree_hash(spoilable)
+    with pytest.raises(DatasetError, match=r"of shape \(1, 4, 31, 3\) instead of \(1, 4, 32, 3\)"):
+        write_shard(str(spoilable), tiny_dataset(), shard, np.zeros((1, 4, 31, 3), np.float32))
     assert tree_hash(spoilable) == before
 
 
@@ -67,7 +68,7 @@ def test_a_complete_dataset_of_other_files_is_not_taken_for_this_one(tmp_path: P
 
 
 def test_a_late_task_of_another_recipe_writes_nothing(spoilable: Path) -> None:
-    before, shard = tree_hash(spoilable), Grid(OTHER).shards()[0]
+    before, shard = tree_hash(spoilable), shards_of(OTHER)[0]
     with pytest.raises(DatasetError, match="is being made by another recipe now"):
         ensure_shard(str(spoilable), OTHER, shard)
     with pytest.raises(DatasetError, match="is being made by another recipe now"):
@@ -102,8 +103,8 @@ def test_a_removal_that_was_cut_short_still_knows_its_own(spoilable: Path, monke
 
 @pytest.mark.parametrize(
     "change",
-    [('"seed": 0', '"seed": 1'), ('"0002": "training"', '"0002": "evaluation"'), ('"metres"', '"inches"')],
-    ids=["recipe", "splits", "units"],
+    [('"seed": 0', '"seed": 1'), ('"Y up', '"Z up'), ('"metres"', '"inches"')],
+    ids=["recipe", "frame", "units"],
 )
 def test_attributes_changed_by_hand_are_written_anew_from_the_given_recipe(
     dataset: str, spoilable: Path, change: tuple[str, str]
@@ -126,18 +127,17 @@ def test_repair_does_not_trust_a_recipe_that_was_changed_by_hand(spoilable: Path
 
 def test_growing_from_what_is_no_longer_there_is_refused(spoilable: Path) -> None:
     """Two appends at once, on a store without a lock: the second does not overwrite the first."""
-    from datagen.bodies import load_body
     from datagen.recipe import Growth
-    from datagen.store.writer import grow
+    from datagen.store.writer import begin
 
     append(str(spoilable), training=5)
     late = tiny_dataset().model_copy(update={"growth": (Growth(evaluation=2),)})
     with pytest.raises(DatasetError, match=r"another recipe \(data.growth"):
-        grow(str(spoilable), late, load_body(late.body))
+        begin(str(spoilable), plan_of(late), growing=True)
     assert open_dataset(str(spoilable)).grid.identity_count == 7
 
 
-@pytest.mark.parametrize("inside", [".git/config", "pose/thesis.txt", "identity/x", "zarr.json"])
+@pytest.mark.parametrize("inside", [".git/config", "pose/thesis.txt", "identity/x", "grid/x", "zarr.json"])
 def test_fresh_removes_nothing_of_anybody_else(tmp_path: Path, inside: str) -> None:
     precious = tmp_path / "mine" / inside
     precious.parent.mkdir(parents=True)
@@ -158,8 +158,8 @@ def test_hidden_files_in_a_dataset_survive_its_removal(spoilable: Path) -> None:
 def test_other_code_does_not_replace_a_committed_shard(
     spoilable: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    shard = Grid(tiny_dataset()).shards()[0]
-    (spoilable / shard_path(shard)).unlink()
+    shard = shards_of(tiny_dataset())[0]
+    (spoilable / shard.path).unlink()
     before = tree_hash(spoilable)
     real = LegModel.vertices
     monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
@@ -168,21 +168,19 @@ def test_other_code_does_not_replace_a_committed_shard(
             generate(tiny_dataset(), str(spoilable))
         else:
             repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
-    assert not (spoilable / shard_path(shard)).exists() and tree_hash(spoilable) == before
+    assert not (spoilable / shard.path).exists() and tree_hash(spoilable) == before
     monkeypatch.undo()
     repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
 
 
 def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from datagen import generate as generation
-
-    generation._require_same_assets.cache_clear()
-    shard = Grid(tiny_dataset()).shards()[0]
-    (spoilable / shard_path(shard)).unlink()
+    require_same_assets.cache_clear()
+    shard = shards_of(tiny_dataset())[0]
+    (spoilable / shard.path).unlink()
     monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "OTHER"),))
     with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg OTHER"):
         ensure_shard(str(spoilable), tiny_dataset(), shard)
-    assert not (spoilable / shard_path(shard)).exists()
+    assert not (spoilable / shard.path).exists()
 
 
 def test_a_link_to_a_dataset_is_under_the_same_lock(spoilable: Path, tmp_path: Path) -> None:
@@ -203,12 +201,27 @@ def test_a_file_url_is_a_folder(dataset: str, tmp_path: Path) -> None:
 
 def test_a_lost_part_of_the_metadata_is_an_error_that_names_the_mending(spoilable: Path) -> None:
     opened = open_dataset(str(spoilable))
-    (spoilable / "identity/0001/vertices/zarr.json").unlink()
-    (spoilable / "identity/0002/zarr.json").unlink()
-    for read in (lambda: opened.vertices(1), lambda: opened.vertex_count(1), lambda: opened.faces(2)):
+    lost = ["grid/training/0/vertices/zarr.json", "topology/0/faces/c/0/0", "grid/evaluation/0/parameters/zarr.json"]
+    for path in lost:
+        (spoilable / path).unlink()
+    for read in (
+        lambda: opened.vertices(1),
+        lambda: opened.vertex_count(1),
+        lambda: opened.faces(2),
+        lambda: opened.parameters(3),
+    ):
         with pytest.raises(DatasetError, match=r"missing or damaged.*--repair"):
             read()
-    assert len(list(find_faults(str(spoilable)))) == 2
+    assert sorted(fault.path for fault in find_faults(str(spoilable))) == sorted(lost)
+
+
+def test_a_body_that_changed_since_the_dataset_was_begun(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its meshes do not fit the arrays: an error, and nothing is written."""
+    shard = shards_of(tiny_dataset())[0]
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses)[:, 1:])
+    with pytest.raises(BodyError, match="identity 0 has 31 vertices in pose 0, and had 32 when the dataset was begun"):
+        make_shard(tiny_dataset(), shard)
 
 
 def test_a_root_that_cannot_be_parsed_names_the_way_out(spoilable: Path) -> None:

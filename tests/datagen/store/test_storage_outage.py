@@ -22,7 +22,8 @@ from datagen import generate as generation
 from datagen.common.errors import DatasetError, StorageError, UnsafeFileError
 from datagen.generate import generate, inline
 from datagen.store import open_dataset, remote_objects
-from datagen.store.schema import open_group, read_bytes, write_bytes
+from datagen.store.objects import list_objects, read_bytes, write_bytes
+from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset
@@ -30,7 +31,7 @@ from training.data.vertex_bank import open_bank
 from workflows.cli.main import main
 from workflows.pipeline import tasks
 
-SHARD = "identity/0001/vertices/c/0/0/0"
+SHARD = "grid/training/0/vertices/c/1/0/0/0"
 
 
 @pytest.fixture
@@ -79,8 +80,6 @@ def bytes_at(url: str) -> dict[str, bytes | None]:
 
 
 def objects_at(url: str) -> list[str]:
-    from datagen.store.schema import list_objects
-
     return list_objects(open_group(url))
 
 

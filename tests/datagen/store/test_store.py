@@ -1,5 +1,6 @@
 """The dataset on disk: its contract, and what happens when it is spoiled. Named after the accidents."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -10,20 +11,21 @@ import zarr
 
 from datagen.common.errors import DatasetError, StorageError
 from datagen.generate import generate, make_shard, repair
-from datagen.grid import Grid
 from datagen.store import open_dataset
-from datagen.store.schema import attributes_of, open_group, shard_path
+from datagen.store.codec import ShardCodec
+from datagen.store.schema import attributes_of, open_group
 from datagen.store.verify import describe, find_faults
 from datagen.store.writer import write_shard
 from tests.support.files import flip_bit, tree_hash, truncate
 from tests.support.layout import layout
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import shards_of, tiny_dataset
+from workflows.cli.main import main
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "dataset_layout.json"
 
 
 def first_shard(url: Path) -> Path:
-    return url / shard_path(Grid(tiny_dataset()).shards()[0])
+    return url / shards_of(tiny_dataset())[0].path
 
 
 def test_layout_on_disk_is_the_documented_one(dataset: str) -> None:
@@ -35,8 +37,8 @@ def test_what_is_read_is_what_was_made(dataset: str) -> None:
     opened = open_dataset(dataset)
     grid, recipe = opened.grid, opened.recipe
     assert recipe == tiny_dataset()
-    for shard in grid.shards():
-        vertices = opened.vertices(shard.identity, grid.rows_of(shard.identity)[shard.start : shard.stop])
+    for shard in opened.arrays.shards():
+        vertices = [opened.vertices(identity, shard.poses) for identity in shard.identities]
         assert np.array_equal(vertices, make_shard(recipe, shard))
     assert np.array_equal(opened.vertices(4, 9), opened.vertices(4)[9])
     assert np.array_equal(opened.evaluation_triples("unseen"), grid.evaluation_triples("unseen"))
@@ -44,8 +46,66 @@ def test_what_is_read_is_what_was_made(dataset: str) -> None:
 
 
 def test_dimensions_are_named(dataset: str) -> None:
-    names = zarr.open_group(dataset, mode="r")["identity/0000/vertices"].metadata.dimension_names
-    assert names == ("row", "vertex", "coordinate")
+    names = zarr.open_group(dataset, mode="r")["grid/training/0/vertices"].metadata.dimension_names
+    assert names == ("identity", "pose", "vertex", "coordinate")
+
+
+def test_zarr_alone_reads_every_array(dataset: str) -> None:
+    """As anybody does who has another program: the same values, along axes that are named and numbered."""
+    opened, group = open_dataset(dataset), zarr.open_group(dataset, mode="r")
+    for array in opened.arrays.arrays:
+        found = {name: group[f"{array.path}/{name}"][...] for name in ("vertices", "identity", "pose", "parameters")}
+        for row, identity in enumerate(found["identity"]):
+            assert np.array_equal(found["vertices"][row], opened.vertices(identity, found["pose"]))
+            assert np.array_equal(found["parameters"][row], opened.parameters(identity))
+    assert np.array_equal(group["topology/0/faces"][...], opened.faces(0))
+    assert np.array_equal(group["pose/parameters"][...], opened.rotations())
+    assert group["grid/topology"][...].tolist() == [0] * 5 and group["topology/vertex_count"][...].tolist() == [32]
+    rows = group["manifest/rows"][...], group["manifest/bytes"][...], group["manifest/sha256"][...]
+    assert [(row.rows, row.bytes, bytes.fromhex(row.sha256)) for row in opened.manifest] == [
+        (*sizes, digest.tobytes()) for *sizes, digest in zip(*rows, strict=True)
+    ]
+
+
+def test_meshes_are_to_the_byte_those_of_format_2(dataset: str) -> None:
+    """Shards of one identity are the very files; as that format's last version wrote them."""
+    digests = sorted(row.sha256 for row in open_dataset(dataset).manifest)
+    assert hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest() == (
+        "cbb122cdb24ff65fd84de5d2d2c7c0bf4e4ece97566fa510510e40bf239719f6"
+    )
+    assert open_dataset(dataset).uuid == "bf0fc157-3e2c-5ee0-af80-49d2e230f96c"
+
+
+def test_several_identities_of_few_poses_share_a_shard(tmp_path: Path, dataset: str) -> None:
+    """The same meshes, encoded the same, in fewer objects; read singly, in part and whole."""
+    made = generate(tiny_dataset(store={"poses_per_shard": 14}), str(tmp_path / "x.zarr"))
+    other = open_dataset(dataset)
+    assert [(shard.identities, len(shard.poses)) for shard in made.arrays.shards()] == [
+        ((0, 1), 6),
+        ((2,), 6),
+        ((3,), 10),
+        ((4,), 10),
+    ]
+    for identity in range(5):
+        whole = other.vertices(identity)
+        assert np.array_equal(made.vertices(identity), whole)
+        assert np.array_equal(made.vertices(identity, [5, 0]), whole[[5, 0]])
+        assert np.array_equal(made.vertices(identity, 3), whole[3])
+    codec = ShardCodec(2, 6, 32, "lz4", 5)
+    file = (tmp_path / "x.zarr" / made.manifest[0].path).read_bytes()
+    chunks = [
+        file[start : start + size]
+        for start, size in codec.places(codec.decode_index(file[-codec.index_bytes :]), codec.rows_of(2, 6))
+    ]
+    old = [shard for shard in other.manifest if shard.path.startswith("grid/training/0/vertices/c/0/")]
+    assert b"".join(chunks[:4]) == (Path(dataset) / old[0].path).read_bytes()[: sum(map(len, chunks[:4]))]
+
+
+def test_identities_that_are_many_are_few_objects(tmp_path: Path) -> None:
+    recipe = tiny_dataset(identities={"training": 300, "evaluation": 0}, store={"poses_per_shard": 60})
+    made = generate(recipe, str(tmp_path / "x.zarr"))
+    objects = sum(path.is_file() for path in (tmp_path / "x.zarr").rglob("*"))
+    assert len(made.manifest) == 30 and objects < 1.2 * 30 + 100
 
 
 def test_making_it_twice_gives_the_same_bytes(dataset: str, tmp_path: Path) -> None:
@@ -62,15 +122,15 @@ def test_a_complete_dataset_is_not_touched_again(spoilable: Path) -> None:
 def test_accidental_shard_delete(spoilable: Path) -> None:
     opened = open_dataset(str(spoilable))
     first_shard(spoilable).unlink()
-    with pytest.raises(DatasetError, match=r"shard identity/0000/vertices/c/0/0/0 is missing.*verify .* --repair"):
+    with pytest.raises(DatasetError, match=r"shard grid/training/0/vertices/c/0/0/0/0 is missing.*verify .* --repair"):
         open_dataset(str(spoilable))
-    with pytest.raises(DatasetError, match="identity/0000/vertices/c/0/0/0 is missing"):
+    with pytest.raises(DatasetError, match="grid/training/0/vertices/c/0/0/0/0 is missing"):
         opened.vertices(0)
 
 
 def test_truncated_shard(spoilable: Path) -> None:
     truncate(first_shard(spoilable))
-    with pytest.raises(DatasetError, match=r"identity/0000.* bytes instead of"):
+    with pytest.raises(DatasetError, match=r"grid/training/0.* bytes instead of"):
         open_dataset(str(spoilable))
 
 
@@ -78,16 +138,16 @@ def test_truncated_shard(spoilable: Path) -> None:
 def test_bit_flip_in_a_shard_is_an_error_and_never_wrong_data(spoilable: Path, at: float) -> None:
     flip_bit(first_shard(spoilable), at=at)
     opened = open_dataset(str(spoilable))
-    with pytest.raises(DatasetError, match=r"identity/0000/vertices/c/0/0/0 is damaged.*--repair"):
+    with pytest.raises(DatasetError, match=r"grid/training/0/vertices/c/0/0/0/0 is damaged.*--repair"):
         opened.vertices(0)
-    assert [fault.path for fault in find_faults(str(spoilable))] == ["identity/0000/vertices/c/0/0/0"]
+    assert [fault.path for fault in find_faults(str(spoilable))] == ["grid/training/0/vertices/c/0/0/0/0"]
 
 
 @pytest.mark.parametrize("spoil", [flip_bit, truncate, Path.unlink])
 def test_repair_brings_the_very_same_bytes_back_and_touches_no_other_shard(
     dataset: str, spoilable: Path, spoil
 ) -> None:
-    others = {path: path.stat().st_mtime_ns for path in spoilable.rglob("c/*/0/0")}
+    others = {path: path.stat().st_mtime_ns for path in spoilable.rglob("c/*/*/0/0")}
     spoil(first_shard(spoilable))
     others.pop(first_shard(spoilable))
     repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
@@ -102,18 +162,20 @@ def small_objects(url: Path) -> list[Path]:
 
 @pytest.mark.parametrize("spoil", [flip_bit, Path.unlink], ids=["bit flip", "loss"])
 def test_every_other_object_that_is_spoiled_is_found_and_mended(dataset: str, spoilable: Path, spoil) -> None:
-    assert len(small_objects(spoilable)) > 30
+    assert len(small_objects(spoilable)) > 40
     for path in small_objects(spoilable):
         spoil(path)
         faults = list(find_faults(str(spoilable)))
-        assert [fault.path for fault in faults if not fault.shard][:1] == [str(path.relative_to(spoilable))], path
+        name = str(path.relative_to(spoilable))
+        expected = "manifest/zarr.json" if name.startswith("manifest/") else name  # it is one thing, in some objects
+        assert [fault.path for fault in faults if not fault.shard][:1] == [expected], path
         repair(str(spoilable), tiny_dataset(), faults)
         assert tree_hash(spoilable) == tree_hash(dataset), path
 
 
 def test_attributes_changed_by_hand_are_refused_and_mended(dataset: str, spoilable: Path) -> None:
     text = (spoilable / "zarr.json").read_text()
-    (spoilable / "zarr.json").write_text(text.replace('"0003": "evaluation"', '"0003": "training"', 1))
+    (spoilable / "zarr.json").write_text(text.replace('"Y up, facing', '"Z up, facing', 1))
     with pytest.raises(DatasetError, match=r"attributes \(zarr.json\) are not as they were written.*--repair"):
         open_dataset(str(spoilable))
     faults = list(find_faults(str(spoilable)))
@@ -129,26 +191,26 @@ def test_a_recipe_changed_by_hand_is_refused(spoilable: Path) -> None:
         open_dataset(str(spoilable))
 
 
-def test_a_manifest_that_is_not_the_committed_one(spoilable: Path) -> None:
-    manifest = spoilable / "manifest/zarr.json"
-    manifest.write_text(manifest.read_text().replace('"rows": 4', '"rows": 3', 1))
+@pytest.mark.parametrize("name", ["rows", "bytes", "extent", "object_sha256"])
+def test_a_manifest_that_is_not_the_committed_one(spoilable: Path, name: str) -> None:
+    array = zarr.open_array(spoilable / "manifest" / name)
+    array[0] = array[0] + 1
     with pytest.raises(DatasetError, match="its manifest is not the one that was committed"):
         open_dataset(str(spoilable))
 
 
 def test_what_a_killed_writer_left_of_a_file_is_removed(dataset: str, spoilable: Path) -> None:
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
-    (spoilable / "identity/0001/vertices/c/0/0/0.1234abcd.partial").write_bytes(b"half a shard")
+    (spoilable / "grid/training/0/vertices/c/1/0/0/0.1234abcd.partial").write_bytes(b"half a shard")
     generate(tiny_dataset(), str(spoilable))
     assert tree_hash(spoilable) == tree_hash(dataset)
 
 
 def test_provenance_names_what_made_the_part_that_was_there(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from datagen.generate import append
-    from datagen.store import attributes
+    from datagen.generate import append, plan
 
     before = open_dataset(str(spoilable)).attributes["provenance"]
-    monkeypatch.setattr(attributes, "_git_commit", lambda: "another")
+    monkeypatch.setattr(plan, "_git_commit", lambda: "another")
     after = append(str(spoilable), training=4).attributes["provenance"]
     assert after["git_commit"] == "another" and after["earlier"] == [before]
 
@@ -181,8 +243,31 @@ def test_metadata_that_is_not_json(spoilable: Path) -> None:
 
 def test_format_version_from_the_future(spoilable: Path) -> None:
     open_group(str(spoilable), mode="r+").attrs["format_version"] = 99
-    with pytest.raises(DatasetError, match="format version 99, this program reads 2; update"):
+    with pytest.raises(DatasetError, match="format version 99, this program reads 3; update"):
         open_dataset(str(spoilable))
+
+
+def test_format_2_is_refused_with_the_command_that_makes_it_anew(
+    spoilable: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every command, in one line; the one that it names makes the dataset, and with the same uuid."""
+    before = open_dataset(str(spoilable)).uuid
+    open_group(str(spoilable), mode="r+").attrs["format_version"] = 2
+    shutil.move(spoilable / "grid", spoilable / "identity")
+    kept = tree_hash(spoilable)
+    advice = f"dsffnet generate --recipe {spoilable} --out NEW.zarr"
+    for command in (
+        "generate --local --recipe smoke --out {}", "append {} --training 9 --local", "verify {}",
+        "verify {} --repair", "inspect {}", "export {} --layout obj --out unused",
+    ):  # fmt: skip
+        with pytest.raises(SystemExit):
+            main(command.format(spoilable).split())
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+        assert f"{spoilable} has format version 2, this program reads 3; make it anew: {advice}" in line
+    assert tree_hash(spoilable) == kept
+    main(advice.replace("NEW.zarr", f"{tmp_path}/new.zarr --local").split()[1:])
+    assert open_dataset(str(tmp_path / "new.zarr")).uuid == before
+    assert generate(tiny_dataset(), str(spoilable), fresh=True).uuid == before and not (spoilable / "identity").exists()
 
 
 def test_recipe_changed_between_runs(spoilable: Path) -> None:
@@ -205,8 +290,8 @@ def test_fresh_never_removes_what_is_not_a_dataset(tmp_path: Path) -> None:
 def test_disk_full_is_one_error_and_earlier_shards_stay(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import zarr.storage._local as local
 
-    shard = Grid(tiny_dataset()).shards()[1]
-    (spoilable / shard_path(shard)).unlink()
+    shard = shards_of(tiny_dataset())[1]
+    (spoilable / shard.path).unlink()
     before = tree_hash(spoilable)
 
     def full(*_: object, **__: object) -> None:
@@ -238,7 +323,7 @@ def test_statistics_are_those_of_all_meshes(dataset: str) -> None:
 def test_made_in_part_then_copied_elsewhere_it_is_finished_there(dataset: str, spoilable: Path, tmp_path: Path) -> None:
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
     shutil.rmtree(spoilable / "manifest")
-    shutil.rmtree(spoilable / "identity" / "0003")
+    shutil.rmtree(spoilable / "grid/evaluation")
     moved = tmp_path / "moved.zarr"
     shutil.move(spoilable, moved)
     generate(tiny_dataset(), str(moved))

@@ -1,10 +1,17 @@
 """Datasets as somebody with bad intentions would send them: changed, and sealed again so that every hash fits."""
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from datagen.store.arrays import put_array, put_group
+from datagen.store.manifest import Manifest, stored_manifest
+from datagen.store.schema import attributes_of, open_group
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -22,22 +29,32 @@ def edit(path: Path, change: Change) -> None:
 
 
 def sealed(url: Path, *, manifest: Change = dict, attributes: Change = dict) -> None:
-    """Change a dataset's manifest and root attributes, and make all hashes fit what is there then."""
+    """Change a dataset's manifest (its columns, and ``objects``) and root attributes; all hashes fit what is there."""
+    group = open_group(str(url), mode="r+")
+    found = stored_manifest(group)
+    objects = {path: _sha256(url / path) or old for path, old in found.objects.items()}
+    content = {name: values.copy() for name, values in found.columns.items()}
+    changed: dict[str, Any] = {**content, "objects": objects}
+    manifest(changed)
+    objects = changed.pop("objects")
+    _write_manifest(group, changed, objects)
+    stated = attributes_of(group)
+    with contextlib.suppress(AttributeError, ValueError, TypeError):  # what no hash can be made of
+        stated["manifest_sha256"] = Manifest(changed, objects).digest()
+    attributes(stated)
+    stated.pop("attributes_sha256", None)
+    edit(url / "zarr.json", lambda root: root.update(attributes={**stated, "attributes_sha256": digest(stated)}))
 
-    def with_hashes(document: dict[str, Any]) -> None:
-        objects = document["attributes"]["objects"]
-        for path in objects:
-            if (url / path).is_file() and (url / path).stat().st_size:
-                objects[path] = hashlib.sha256((url / path).read_bytes()).hexdigest()
-        manifest(document["attributes"])
 
-    def with_digests(document: dict[str, Any]) -> None:
-        content = json.loads((url / "manifest/zarr.json").read_text())["attributes"]
-        found = document["attributes"]
-        attributes(found)
-        found["manifest_sha256"] = digest(content)
-        found.pop("attributes_sha256", None)
-        found["attributes_sha256"] = digest(found)
+def _sha256(path: Path) -> str | None:
+    """Of a file that can be read as one."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() and path.stat().st_size else None
 
-    edit(url / "manifest/zarr.json", with_hashes)
-    edit(url / "zarr.json", with_digests)
+
+def _write_manifest(group: Any, columns: dict[str, np.ndarray], objects: Any) -> None:
+    if isinstance(objects, dict):
+        hashes = b"".join(map(bytes.fromhex, objects.values()))
+        put_array(group, "manifest/object_sha256", np.frombuffer(hashes, np.uint8).reshape(-1, 32), ("object", "byte"))
+    put_group(group, "manifest", {"objects": list(objects) if isinstance(objects, dict) else objects})
+    for name, values in columns.items():
+        put_array(group, f"manifest/{name}", values, ["shard"] * values.ndim)

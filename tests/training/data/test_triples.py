@@ -11,6 +11,7 @@ from datagen.bodies import load_body
 from datagen.common.errors import DatasetError, RecipeError
 from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box
+from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import mixed_dataset, tiny_dataset
@@ -102,7 +103,7 @@ def test_truth_has_the_targets_identity_parameters_and_the_sources_pose_paramete
     identities, poses = dataset.identities("training"), dataset.grid.poses("seen")
     (triples,) = next(TripleOrder(identities, poses, batch=len(identities) * len(poses), seed=3).batches(first_step=0))
     batch = open_bank(dataset, identities).batch(triples)
-    rotations = dataset.poses().rotations
+    rotations = dataset.rotations()
     for row, (source, source_pose, target, target_pose) in enumerate(triples.tolist()):
         assert not np.array_equal(dataset.parameters(source), dataset.parameters(target)), "another identity"
         assert not np.array_equal(rotations[source_pose], rotations[target_pose]), "another pose"
@@ -118,6 +119,7 @@ def test_truth_has_the_targets_identity_parameters_and_the_sources_pose_paramete
 
 def made_anew(dataset: Dataset, identity: int, pose: int) -> np.ndarray:
     """A normalised mesh [vertex, 3] from the stored parameters of an identity and of a pose."""
-    poses = dataset.poses()[pose : pose + 1]
+    tree = (tuple(dataset.attributes[name]) for name in ("joints", "joint_parents"))
+    poses = Poses(*tree, dataset.rotations()[pose : pose + 1])
     (vertices,) = load_body(dataset.recipe.body).vertices(dataset.parameters(identity), poses)
     return bounding_box(vertices).normalise(vertices)

@@ -127,10 +127,10 @@ def test_a_bank_knows_what_it_does_not_have(dataset: str) -> None:
 @pytest.mark.parametrize("damage", [flip_bit, truncate, Path.unlink], ids=["bit flip", "truncated", "missing"])
 def test_a_damaged_shard_is_the_datasets_own_error(spoilable: Path, cache: str, damage: Any) -> None:
     opened = open_dataset(str(spoilable))
-    for shard in (spoilable / "identity" / "0001" / "vertices" / "c").rglob("0"):
+    for shard in (spoilable / "grid/training/0/vertices/c/1").glob("*/0/0"):
         if shard.is_file():
             damage(shard)
-    with pytest.raises(DatasetError, match=r"shard identity/0001/vertices/c/0/0/0 is .*verify .* --repair"):
+    with pytest.raises(DatasetError, match=r"shard grid/training/0/vertices/c/1/0/0/0 is .*verify .* --repair"):
         steps(training_bank(opened, cache), opened, count=2)
 
 

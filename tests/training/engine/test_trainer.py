@@ -229,8 +229,8 @@ def test_another_dataset_or_recipe_is_refused(dataset: str, undisturbed: Path, t
 
 
 def test_a_damaged_dataset_is_refused(spoilable: Path, tmp_path: Path) -> None:
-    flip_bit(spoilable / "identity/0001/vertices/c/0/0/0")
-    with pytest.raises(DatasetError, match=r"identity/0001/vertices/c/0/0/0 is damaged.*verify .* --repair"):
+    flip_bit(spoilable / "grid/training/0/vertices/c/1/0/0/0")
+    with pytest.raises(DatasetError, match=r"grid/training/0/vertices/c/1/0/0/0 is damaged.*verify .* --repair"):
         train(tiny_training(), data=str(spoilable), run=tmp_path / "run")
 
 

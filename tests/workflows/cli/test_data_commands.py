@@ -92,7 +92,7 @@ def test_a_moved_model_file_is_named_when_going_on(tmp_path: Path) -> None:
     (tmp_path / "a.npz").rename(tmp_path / "b.npz")
     load_body.cache_clear()  # another process would not have it
     fails(command("append", data, "--unseen", "3", "--local"), 1, "a.npz")
-    (data / "identity/0001/vertices/c/0/0/0").unlink()
+    (data / "grid/training/0/vertices/c/0/0/0/0").unlink()
     assert command("verify", data, "--repair", "--set", f"{path}/b.npz").returncode == 0
     assert command("append", data, "--unseen", "3", "--local").returncode == 0, "the new path was kept"
     fails(command("append", data, "--unseen", "4", "--set", "data.poses.seed=4"), 2, "can only change where")

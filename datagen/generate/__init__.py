@@ -1,0 +1,205 @@
+"""Generation: a driver that can always be run again around ``make_shard``, a pure function of (recipe, shard).
+
+The driver asks for every shard of the grid. A task returns the manifest row of a shard that is there and sound, or
+makes and writes it; so a run after any interruption does only what is missing, and the bytes come out the same.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+from pydantic import ValidationError
+
+from datagen.bodies import load_body
+from datagen.common.errors import BodyError, DatasetError, RecipeError
+from datagen.generate.plan import assets_of
+from datagen.generate.runners import Runner, Task, inline, ray_runner
+from datagen.generate.shards import ensure_shard, make_shard, prepare
+from datagen.grid import Grid
+from datagen.recipe import DatasetRecipe, Growth
+from datagen.recipe.text import faults_text
+from datagen.sizes import require_memory
+from datagen.store.attributes import check_same_assets
+from datagen.store.location import remove, require_ours, writing_alone
+from datagen.store.manifest import ManifestRow
+from datagen.store.reader import Dataset, open_dataset
+from datagen.store.schema import check_extent, open_group, stored_recipe
+from datagen.store.verify import Fault, find_faults
+from datagen.store.writer import committed_hashes, finish
+
+__all__ = [
+    "Progress",
+    "Runner",
+    "Task",
+    "append",
+    "ensure_shard",
+    "generate",
+    "grown_recipe",
+    "inline",
+    "make_shard",
+    "prepare",
+    "ray_runner",
+    "repair",
+]
+
+log = logging.getLogger(__name__)
+Progress = Callable[[Iterator[ManifestRow], Grid], Iterable[ManifestRow]]
+
+
+def generate(
+    recipe: DatasetRecipe,
+    url: str,
+    *,
+    run: Runner = inline,
+    progress: Progress = lambda rows, grid: rows,
+    fresh: bool = False,
+) -> Dataset:
+    """Make the dataset at ``url``, or what is missing of it; a complete one is returned as it is.
+
+    Parameters
+    ----------
+    recipe
+        What to make.
+    url
+        A folder or any store URL that zarr opens; use an absolute path when tasks run on other machines.
+    run
+        Where the tasks run.
+    progress
+        Wraps the stream of finished shards, for a progress bar.
+    fresh
+        Remove what is there first.
+
+    Raises
+    ------
+    DatasetError
+        A dataset of another recipe is there, or somebody else is writing to it.
+    RecipeError
+        Memory has no room to make it.
+    """
+    if not fresh and _complete(url, recipe):
+        return open_dataset(url)
+    require_memory(recipe)
+    check_extent(url, recipe)
+    require_ours(url)
+    with writing_alone(url):
+        if fresh:
+            remove(url)
+        _make_missing(recipe, url, run, progress)
+    return open_dataset(url)
+
+
+def append(
+    url: str,
+    *,
+    training: int | None = None,
+    evaluation: int | None = None,
+    seen: int | None = None,
+    unseen: int | None = None,
+    recipe: DatasetRecipe | None = None,
+    run: Runner = inline,
+    progress: Progress = lambda rows, grid: rows,
+) -> Dataset:
+    """Give an existing dataset more identities or poses, up to these totals; no shard that is there is touched.
+
+    The totals make it repeatable: the same call again goes on after an interruption, and does nothing when done.
+    The result is, byte for byte, what the grown recipe makes from nothing. ``recipe`` is the dataset's own, with other
+    paths where asset files have moved. A store without a lock (S3) is to be appended to from one place at a time.
+
+    Raises
+    ------
+    DatasetError
+        There is no dataset, it is unfinished, or it has more than a total already.
+    RecipeError
+        Memory has no room to make it.
+    """
+    totals = {"training": training, "evaluation": evaluation, "seen": seen, "unseen": unseen}
+    with writing_alone(url):
+        stored = recipe or stored_recipe(url, open_group(url))
+        grown = grown_recipe(url, stored, totals)
+        require_memory(grown)
+        check_extent(url, grown)
+        if grown != stored:
+            open_dataset(url)  # an unfinished one must be finished first, and says how
+            _make_missing(grown, url, run, progress, growing=True)
+        elif not _complete(url, stored):
+            _make_missing(stored, url, run, progress)
+    return open_dataset(url)
+
+
+def grown_recipe(url: str, recipe: DatasetRecipe, totals: Mapping[str, int | None]) -> DatasetRecipe:
+    """Return the recipe of the dataset at ``url`` after appending up to these totals (of ``append``'s arguments).
+
+    Raises
+    ------
+    DatasetError
+        It has more than a total already, or cannot take more seen poses.
+    RecipeError
+        A total is no number to count with.
+    """
+    steps = Grid(recipe).steps
+    present = {name: sum(getattr(step, name) for step in steps) for name in totals}
+    more = {name: total - present[name] for name, total in totals.items() if total is not None}
+    for name, count in more.items():
+        if count < 0:
+            raise DatasetError(
+                f"{url} has {present[name]} {name}, more than {totals[name]}; appending does not take away. "
+                "Name a larger total, or make a new dataset with dsffnet generate"
+            )
+    if not any(more.values()):
+        return recipe
+    if more.get("seen") and getattr(recipe.poses.distribution, "held_out", None):
+        raise DatasetError(
+            f"{url} holds out some of its motions for unseen poses, and a pose that is appended as seen could not be "
+            "told from them. Append unseen poses only, or make a new dataset with dsffnet generate"
+        )
+    try:
+        added = Growth(**more)
+    except ValidationError as error:
+        raise RecipeError(f"{url} cannot be appended to: {faults_text(error)}") from error
+    return recipe.model_copy(update={"growth": (*recipe.growth, added)})
+
+
+def _complete(url: str, recipe: DatasetRecipe) -> bool:
+    """Whether a dataset of this recipe and of the assets that it names now is there and whole."""
+    try:
+        dataset = open_dataset(url)
+    except DatasetError:
+        return False
+    if dataset.recipe.sha256() != recipe.sha256():
+        return False
+    try:
+        check_same_assets(url, dataset.group, assets_of(recipe, load_body(recipe.body)))
+    except BodyError as error:
+        log.warning("%s is complete; whether its assets are those of the recipe cannot be checked: %s", url, error)
+    return True
+
+
+def _make_missing(
+    recipe: DatasetRecipe,
+    url: str,
+    run: Runner,
+    progress: Progress,
+    *,
+    growing: bool = False,
+    lost: Sequence[str] = (),
+) -> None:
+    (arrays,) = run(prepare, [(url, recipe, growing, lost)])
+    committed = committed_hashes(url)
+    shards = [(url, recipe, shard, committed.get(shard.path)) for shard in arrays.shards()]
+    finish(url, recipe, list(progress(run(ensure_shard, shards), Grid(recipe))))
+
+
+def repair(
+    url: str,
+    recipe: DatasetRecipe,
+    faults: list[Fault],
+    *,
+    run: Runner = inline,
+    progress: Progress = lambda rows, grid: rows,
+) -> Dataset:
+    """Make the faulty shards and other objects again and check that the dataset is whole; the rest is not touched."""
+    with writing_alone(url):
+        _make_missing(recipe, url, run, progress, lost=[fault.path for fault in faults if not fault.shard])
+    left = list(find_faults(url))
+    if left:
+        raise DatasetError(f"{url}: {left[0].path} is still faulty after repair ({left[0].reason})")
+    return open_dataset(url)
