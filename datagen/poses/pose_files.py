@@ -11,6 +11,7 @@ from datagen.common.assets import Asset, file_asset
 from datagen.common.errors import RecipeError, reason_of
 from datagen.common.files import write_atomically
 from datagen.common.npz import FAULTS, read_arrays
+from datagen.mesh.rig import drivers_of
 from datagen.poses import Poses
 from datagen.poses.skeletons import JOINTS, PARENTS, SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import FilePoses, PoseRecipe
@@ -179,12 +180,6 @@ def _known_parents(joints: Sequence[str]) -> tuple[int, ...] | None:
     """Each joint's nearest ancestor among ``joints`` in SMPL's tree, or else SMAL's: joints left out do not turn."""
     for names, parents in ((JOINTS, PARENTS), (SMAL_JOINTS, SMAL_PARENTS)):
         if set(joints) <= set(names):
-            return tuple(_nearest(joint, joints, names, parents) for joint in joints)
+            nearest = (*drivers_of(names, parents, joints), -1)
+            return tuple(nearest[parents[names.index(joint)]] for joint in joints)
     return None
-
-
-def _nearest(joint: str, joints: Sequence[str], names: Sequence[str], parents: Sequence[int]) -> int:
-    ancestor = parents[names.index(joint)]
-    while ancestor >= 0 and names[ancestor] not in joints:
-        ancestor = parents[ancestor]
-    return joints.index(names[ancestor]) if ancestor >= 0 else -1

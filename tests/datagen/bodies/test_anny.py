@@ -15,9 +15,9 @@ from datagen.bodies import load_body
 from datagen.bodies.anny.model import AnnyModel, _alone_with_whole_files
 from datagen.bodies.anny.shape import variation_shares
 from datagen.common.errors import BodyError
-from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe
+from tests.support.shapes.bodies import identity
 
 ALL_AGES = PhenotypeRanges(age=(0.0, 1.0))
 POSES = draw_poses(PoseRecipe(), range(12))
@@ -28,10 +28,6 @@ def body(topology: AnnyTopology = "notoes_collapse3pc", **options: Any) -> AnnyM
     model = load_body(AnnyBody(topology=topology, **options))
     assert isinstance(model, AnnyModel)
     return model
-
-
-def identity(model: AnnyModel, number: int = 0) -> np.ndarray:
-    return model.draw_identity(generator(0, Stream.IDENTITY, number), number)
 
 
 def drawn(model: AnnyModel, count: int) -> dict[str, np.ndarray]:
@@ -109,7 +105,7 @@ class TestShape:
             [0.654992, 0.829885, -0.078288],
             [0.320893, -0.691064, 0.304906],
         ]
-        parameters = model.draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+        parameters = identity(model)
         found = model.vertices(parameters, POSES[:1])[0, [0, 150, 300, 450, 614]]
         assert found == pytest.approx(np.array(expected), abs=2e-6)
 

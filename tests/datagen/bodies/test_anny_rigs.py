@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from datagen.bodies import BodyModel, load_body
 from datagen.bodies.anny.rigs import Bones, carriers, parents_first, t_pose_corrections
-from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, AnnyRig, AnnyTopology, PhenotypeRanges, PoseRecipe
+from tests.support.shapes.bodies import identity
 
 RIGS: tuple[AnnyRig, ...] = get_args(AnnyRig)
 TOPOLOGIES: tuple[AnnyTopology, ...] = get_args(AnnyTopology)
@@ -34,10 +34,6 @@ T_POSE = Poses(JOINTS, PARENTS, np.zeros((1, len(JOINTS), 3)))
 
 def body(topology: AnnyTopology = "notoes_collapse3pc", **options: Any) -> BodyModel:
     return load_body(AnnyBody(topology=topology, **options))
-
-
-def identity(model: BodyModel, number: int = 0) -> np.ndarray:
-    return model.draw_identity(generator(0, Stream.IDENTITY, number), number)
 
 
 class TestRigs:

@@ -11,9 +11,9 @@ from datagen.bodies.smpl_family.model_file import KEYS, convert_model
 from datagen.bodies.smpl_family.model_search import FOLDER_VARIABLE, find_model
 from datagen.bodies.smpl_family.smpl import SmplModel
 from datagen.common.errors import BodyError
-from datagen.common.seeding import Stream, generator
 from datagen.poses import PARENTS, draw_poses
 from datagen.recipe import PoseRecipe, SmplBody
+from tests.support.shapes.bodies import identity
 from tests.support.shapes.models import Arrays, arrays_of, random_model, save_npz, save_pickle, tree
 
 
@@ -28,7 +28,7 @@ def test_pickle_and_its_conversion_give_identical_vertices(protocol: int, tmp_pa
         assert all(np.array_equal(plain[key], arrays_of("smpl")[key]) for key in KEYS)
     poses = draw_poses(PoseRecipe(), range(4))
     bodies = [SmplModel(SmplBody(path=str(path))) for path in (original, converted)]
-    betas = bodies[0].draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+    betas = identity(bodies[0])
     assert np.array_equal(bodies[0].vertices(betas, poses), bodies[1].vertices(betas, poses))
     again = convert_model(converted, tmp_path / "again.npz")
     assert again.read_bytes() == converted.read_bytes()

@@ -11,11 +11,11 @@ from datagen.bodies.smpl_family.model_search import FOLDER_VARIABLE, find_model
 from datagen.bodies.smpl_family.smal import SmalModel
 from datagen.bodies.standins.smpl_format import write_standin
 from datagen.common.errors import BodyError
-from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import PoseRecipe, RangePoses, SmalBody
+from tests.support.shapes.bodies import identity
 from tests.support.shapes.models import Arrays, random_model, reference, save_npz, save_pickle
 
 RANGES = PoseRecipe(distribution=RangePoses(skeleton="smal", uniform=20))
@@ -49,7 +49,7 @@ def test_equals_the_reference_implementation_in_smals_own_frame(joints: int, sav
     arrays = arrays_of(joints)
     path = (save_npz if save is save_npz else save_pickle)(tmp_path / "smal.npz", arrays)
     body, poses = SmalModel(SmalBody(path=str(path))), draw_poses(RANGES, range(40))
-    betas = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+    betas = identity(body)
     expected = to_ours(reference(arrays, betas, to_native(poses.rotations[:, :joints])))
     flat = to_ours(
         reference({**arrays, "posedirs": 0 * arrays["posedirs"]}, betas, to_native(poses.rotations[:, :joints]))
@@ -83,7 +83,7 @@ def test_the_animal_stands_in_our_frame(animal: Path) -> None:
 
 def test_meshes_are_usable_and_identities_differ(animal: Path) -> None:
     body, poses = load_body(SmalBody(path=str(animal))), draw_poses(RANGES, range(3))
-    drawn = np.stack([body.draw_identity(generator(0, Stream.IDENTITY, n), n) for n in range(200)])
+    drawn = np.stack([identity(body, n) for n in range(200)])
     assert drawn.shape[1] == 41 == len(body.parameter_names) and 0.95 < np.abs(drawn).max() <= 1
     assert np.abs(drawn.std(axis=0) - 1 / np.sqrt(3)).max() < 0.1
     for parameters in drawn[:3]:
@@ -116,7 +116,7 @@ def test_identities_of_families_scatter_around_their_means(animal: Path, tmp_pat
     """Identity modulo five is the family; deviations are uniform, in that family's standard deviations."""
     data = families_file(tmp_path / "smal_CVPR2017_data.pkl")
     body = SmalModel(SmalBody(path=str(animal), families=str(data), beta_range=0.5))
-    drawn = np.stack([body.draw_identity(generator(0, Stream.IDENTITY, n), n) for n in range(500)])
+    drawn = np.stack([identity(body, n) for n in range(500)])
     means = np.arange(5 * 41.0).reshape(5, 41) / 100
     for family in range(5):
         deviation = drawn[family::5] - means[family]
@@ -125,7 +125,7 @@ def test_identities_of_families_scatter_around_their_means(animal: Path, tmp_pat
     assert [asset.name for asset in body.assets] == ["SMAL", "SMAL families"]
     assert "non-commercial" in body.assets[1].licence and body.assets[0].licence.startswith("NOT the licensed")
     fewer = SmalModel(SmalBody(path=str(animal), families=str(data), betas=3))
-    assert fewer.draw_identity(generator(0, Stream.IDENTITY, 0), 0).shape == (3,)
+    assert identity(fewer).shape == (3,)
 
 
 def test_files_that_do_not_fit_are_refused(animal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,10 +19,10 @@ from datagen.bodies.smpl_family.model_search import find_model
 from datagen.bodies.smpl_family.smpl import SmplModel, joint_names
 from datagen.bodies.standins.smpl_format import standin, write_standin
 from datagen.common.errors import BodyError
-from datagen.common.seeding import Stream, generator
 from datagen.mesh.rig import skinned
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, MixedBody, PoseRecipe, RangePoses, SmplBody
+from tests.support.shapes.bodies import identity
 from tests.support.shapes.models import arrays_of, random_model, reference, save_npz, tree
 
 MODELS = ("smpl", "smplh", "smplx")
@@ -54,7 +54,7 @@ def test_equals_the_reference_implementation(model: str, degrees: float, toleran
     """
     path = save_npz(tmp_path / "model.npz", arrays_of(model))
     body, poses = SmplModel(SmplBody(model=model, path=str(path))), random_poses(model, degrees=degrees)
-    betas = body.draw_identity(generator(3, Stream.IDENTITY, 0), 0)
+    betas = identity(body, 0, seed=3)
     expected = reference(arrays_of(model), betas, poses.rotations)
     still = reference({**arrays_of(model), "posedirs": arrays_of(model)["posedirs"] * 0}, betas, poses.rotations)
     assert np.abs(expected - still).max() > 0.02, "the pose blend shapes matter"
@@ -68,7 +68,7 @@ def test_equals_smplx_own_smpl_class(tmp_path: Path) -> None:
     vertex_ids = dict.fromkeys([*FACE, *FEET, *TIPS], 0)
     theirs = smplx.SMPL("", data_struct=Struct(**arrays), vertex_ids=vertex_ids, dtype=torch.float64, batch_size=8)
     body = SmplModel(SmplBody(path=str(save_npz(tmp_path / "smpl.npz", arrays))))
-    betas, poses = body.draw_identity(generator(0, Stream.IDENTITY, 1), 1), NPT[:8]
+    betas, poses = identity(body, 1), NPT[:8]
     rotations = torch.from_numpy(poses.rotations)
     posed = theirs(
         betas=torch.from_numpy(betas)[None].expand(8, -1),
@@ -94,7 +94,7 @@ def test_equals_smplx_own_smplx_class(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(smplx.body_models.VERTEX_IDS, "smplx", dict.fromkeys([*FACE, *FEET, *TIPS], 0))
     theirs = smplx.SMPLX(str(path), ext="npz", use_pca=False, dtype=torch.float64, batch_size=8)
     body, poses = SmplModel(SmplBody(model="smplx", path=str(path))), random_poses("smplx", count=8)
-    betas = body.draw_identity(generator(0, Stream.IDENTITY, 1), 1)
+    betas = identity(body, 1)
     parts = {"global_orient": 0, "body_pose": 1, "jaw_pose": 22, "leye_pose": 23, "reye_pose": 24,
              "left_hand_pose": 25, "right_hand_pose": 40, "end": 55}  # fmt: skip
     ends = [*parts.values()][1:]
@@ -137,7 +137,7 @@ def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(tmp_path: P
 def test_pose_blend_shapes_see_rotations_relative_to_the_parent(tmp_path: Path) -> None:
     """Turning the whole body changes nothing but its direction."""
     body = SmplModel(SmplBody(path=str(save_npz(tmp_path / "m.npz", arrays_of("smpl")))))
-    betas = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+    betas = identity(body)
     bent = NPT.rotations[:2].copy()
     bent[0, 0], bent[1] = 0, bent[0]
     bent[1, 0] = [0.0, np.pi / 2, 0.0]
@@ -151,7 +151,7 @@ def test_a_rig_leaves_out_the_pose_blend_shapes_and_nothing_else(tmp_path: Path)
     """Added to the vertices at rest they give the body's; without them the rig is off by what they displace."""
     path = save_npz(tmp_path / "m.npz", arrays_of("smpl"))
     body, layout = SmplModel(SmplBody(path=str(path))), LayoutBody(read_model(path), betas=10, reach=4)
-    betas, world = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0), NPT.on(JOINTS, PARENTS)
+    betas, world = identity(body), NPT.on(JOINTS, PARENTS)
     rig, rest, displaced = body.rig(betas, JOINTS), layout.rest(betas).vertices, layout.correctives(world)
     posed, transforms = body.vertices(betas, NPT), rig.transforms(NPT.world())
     with_them = [
@@ -175,11 +175,11 @@ def test_joints_that_the_poses_do_not_turn_are_folded(model: str, kept: int, sta
 def test_identities_are_npts(stand_ins: Path) -> None:
     """Uniform within +-4, ten of them, each a function of seed and number."""
     body = load_body(SmplBody(path=str(stand_ins)))
-    drawn = np.stack([body.draw_identity(generator(0, Stream.IDENTITY, n), n) for n in range(400)])
+    drawn = np.stack([identity(body, n) for n in range(400)])
     assert body.parameter_names == tuple(f"beta{n}" for n in range(10))
     assert drawn.min() < -3.9 and drawn.max() > 3.9 and np.abs(drawn).max() <= 4
     assert np.abs(drawn.std(axis=0) - 8 / np.sqrt(12)).max() < 0.25
-    assert np.array_equal(drawn[7], body.draw_identity(generator(0, Stream.IDENTITY, 7), 7))
+    assert np.array_equal(drawn[7], identity(body, 7))
 
 
 @pytest.mark.parametrize("model", MODELS[1:])
@@ -220,8 +220,8 @@ def test_people_of_anny_and_smpl_in_one_dataset(stand_ins: Path) -> None:
     body = load_body(recipe)
     assert set(JOINTS) <= set(body.joints) and len(body.assets) == 2
     counts = []
-    for identity in range(4):
-        parameters = body.draw_identity(generator(0, Stream.IDENTITY, identity), identity)
+    for number in range(4):
+        parameters = identity(body, number)
         vertices, faces = body.vertices(parameters, NPT[:3]), body.faces(parameters)
         assert np.isfinite(vertices).all() and faces.max() == vertices.shape[1] - 1
         counts.append(vertices.shape[1])
@@ -259,7 +259,7 @@ def test_licensed_files_equal_the_reference(model: str) -> None:
     """With files of the user's in the folder that DSFFNET_BODY_MODELS names."""
     path = find_model(None, model=model)
     body, file = SmplModel(SmplBody(model=model)), read_model(path)
-    betas, poses = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0), random_poses(model, count=4)
+    betas, poses = identity(body), random_poses(model, count=4)
     arrays = {"v_template": file.template, "shapedirs": file.shapedirs, "posedirs": file.posedirs,
               "J_regressor": file.regressor, "weights": file.weights,
               "kintree_table": np.array([file.parents, range(len(file.parents))])}  # fmt: skip

@@ -18,6 +18,7 @@ from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import edges_of
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import AnnyBody
+from tests.support.shapes.bodies import identity
 
 KINDS = {"smpl": (24, 10), "smplh": (52, 10), "smplx": (55, 20), "smal": (35, 41)}
 COARSE = "notoes_collapse3pc"
@@ -64,7 +65,7 @@ def test_regressed_joints_lie_where_annys_do(kind: str, files: dict[str, Path]) 
     bones = {name: _pivots(name, carried) for name, carried in _by_joint(names).items()}
     apart = []
     for number in range(500, 520):
-        vertices, heads = body.t_pose(body.draw_identity(generator(0, Stream.IDENTITY, number), number))
+        vertices, heads = body.t_pose(identity(body, number))
         truth = np.stack([heads[bones[name]].mean(axis=0) for name in names])
         apart.append(np.linalg.norm(regressor @ vertices - truth, axis=1))
     assert np.mean(apart) < 0.0025 and np.max(apart) < 0.018
@@ -74,9 +75,7 @@ def test_new_people_of_anny_are_within_the_shape_space(files: dict[str, Path]) -
     model = read_model(files["smpl"])
     body = AnnyModel(AnnyBody(topology=COARSE, rig="mixamo", phenotypes=_ADULTS))
     for number in range(500, 510):
-        offset = (
-            body.t_pose(body.draw_identity(generator(0, Stream.IDENTITY, number), number))[0] - model.template
-        ).ravel()
+        offset = (body.t_pose(identity(body, number))[0] - model.template).ravel()
         directions = model.shapedirs.reshape(-1, 10)
         betas, *_ = np.linalg.lstsq(directions, offset, rcond=None)
         left = np.linalg.norm((offset - directions @ betas).reshape(-1, 3), axis=1)

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from datagen.bodies import load_body
 from datagen.characters.character import load_character, load_characters
 from datagen.common.errors import RecipeError
-from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import edges_of
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.animation_clips import ClipSource, shared_skeleton
 from datagen.recipe import ClipPoses, PoseRecipe, RangePoses, RiggedBody
+from tests.support.shapes.bodies import identity
 from tests.support.shapes.real_animals import require_animals
 from tests.support.shapes.rigged_files import BOXES, JOINTS, Floats, Rig, about
 
@@ -95,7 +95,7 @@ def test_a_clip_turns_other_characters_alike(folder: Path) -> None:
     moved = []
     for name in ("person", "devil"):
         body = load_body(RiggedBody(path=str(folder), characters=(name,), bone_scale=0.0))
-        parameters = body.draw_identity(generator(0, Stream.IDENTITY, 0), 0)
+        parameters = identity(body)
         still = Poses(its.joints, its.parents, np.zeros((1, len(its.joints), 3)))
         moved.append((body.vertices(parameters, poses) - body.vertices(parameters, still))[0, : 8 * len(BOXES)])
     assert np.abs(moved[0]).max() > 0.5 and np.abs(moved[0] - moved[1]).max() < 1e-5

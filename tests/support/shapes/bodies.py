@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from datagen.bodies.standins.smpl_format import write_standin
+from datagen.common.seeding import Stream, generator
 from tests.support.shapes.meshes import npt_folder
 from tests.support.shapes.rigged_files import BOXES, JOINTS, Rig, about
 
@@ -13,6 +14,11 @@ COARSE = "notoes_collapse3pc"
 FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "leg")
 PEOPLE = ("anny", "smpl", "smplh", "smplx", "mixed")
 NPT = {"name": "npt"}
+
+
+def identity(body: Any, number: int = 0, *, seed: int = 0) -> np.ndarray:
+    """Parameters of a body's identity, as a recipe with that seed draws them."""
+    return np.asarray(body.draw_identity(generator(seed, Stream.IDENTITY, number), number))
 
 
 def recipe_parts(family: str, folder: Path) -> dict[str, Any]:
