@@ -40,14 +40,16 @@ def resolve_within(folder: Path, name: str) -> Path:
     path = Path(os.path.realpath(root / name))
     if not path.is_relative_to(root) or path.is_symlink():  # what is a link still leads to itself
         raise UnsafeFileError(
-            f"{folder} names {name!r}, a link that leads out of it. Do not trust what it holds; a link of "
-            "yours may lead to the whole folder"
+            f"{folder} names {name!r}, a link that leads out of it. If it is yours, link the whole folder {root} "
+            "instead (docs/tracking.md); else remove it, and do not trust what the folder holds"
         )
     return path
 
 
-def refuse_links_out(folder: Path) -> None:
+def refuse_links_out(folder: Path, *, but: tuple[str, ...] = ()) -> None:
     """Raise if something directly in a folder, which need not exist, is a link that leads out of it.
+
+    ``but`` are names that may be such links.
 
     Raises
     ------
@@ -56,7 +58,7 @@ def refuse_links_out(folder: Path) -> None:
     """
     if folder.is_dir():
         for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
-            if entry.is_symlink():
+            if entry.is_symlink() and entry.name not in but:
                 resolve_within(folder, entry.name)
 
 

@@ -45,7 +45,7 @@ def container_memory(cgroup: Path = _CGROUP) -> int:
 
 def free_disk(folder: Path) -> int:
     """Return the bytes that are free on the disk on which a folder lies or will lie."""
-    whole = folder.absolute()
+    whole = Path(os.path.realpath(folder))
     there = next(place for place in (whole, *whole.parents) if os.path.exists(place))  # Path's raises if not permitted
     return shutil.disk_usage(there).free
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import psutil
 
-from datagen.common.errors import StorageError
+from datagen.common.errors import DsffnetError
 from training.tracking.journal import Journal
 from training.tracking.threads import background
 
@@ -115,5 +115,5 @@ def _sample(path: Path, stop: threading.Event, every: float) -> None:
             while not stop.wait(every):
                 journal.write(step, load.read())
                 step += 1
-    except (StorageError, OSError, psutil.Error) as error:
+    except (DsffnetError, OSError, psutil.Error) as error:
         log.warning("the load of this machine is no longer noted in %s: %s", path, error)

@@ -1,14 +1,12 @@
 """What a dataset will take, reported before it is made; one that memory or the disk has no room for is refused."""
 
-import os
-
-from datagen.common.errors import DatasetError
+from datagen.common.errors import DatasetError, RecipeError
 from datagen.recipe import DatasetRecipe
 from datagen.sizes import require_disk, size_of
 from datagen.store import open_dataset
 from datagen.store.objects import is_local, plain
 from datagen.store.schema import check_extent
-from workflows.pipeline.ray_cluster import on_cluster
+from workflows.pipeline.ray_cluster import on_cluster, worker_count
 from workflows.pipeline.stage import say
 from workflows.pipeline.tasks import RAY_FROM_MESHES
 
@@ -39,7 +37,10 @@ def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, loc
     one_task = local or on_cluster()  # of a cluster, this machine's memory says nothing of the others'
     size = size_of(recipe, workers=1)
     if not one_task and size.meshes >= RAY_FROM_MESHES:
-        size = size_of(recipe, workers=os.cpu_count() or 1)
+        try:
+            size = size_of(recipe, workers=worker_count())
+        except RecipeError as error:  # one worker has room
+            raise RecipeError(f"{error}, or work in one process: --local, where the command has it") from error
     check_extent(url, recipe)
     say(f"generate: {size}")
     if is_local(url) and not yes:

@@ -38,9 +38,11 @@ def _start() -> None:
             with _patience(seconds):
                 _init()
             return
-        except Exception as error:
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        except BaseException as error:
             _end_processes()
+            if not isinstance(error, Exception):  # interrupted, or told to stop
+                raise
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             if seconds != _START_SECONDS[-1]:
                 print(f"Ray did not start ({reason}); once more, with more time", file=sys.stderr, flush=True)
     raise ClusterError(
@@ -77,7 +79,7 @@ def sigterm_kept() -> Iterator[None]:
     finally:
         utils.set_sigterm_handler = set_handler
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, before)
+            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)  # None: a handler that is not Python's
 
 
 @contextmanager
@@ -146,6 +148,7 @@ def own_ray() -> Iterator[None]:
     _start()
     watch = _Watch()
     try:
+        watch.find()
         with _interrupted_by(watch):
             try:
                 yield
@@ -171,7 +174,7 @@ def _interrupted_by(watch: "_Watch") -> Iterator[None]:
         with background(watch.run, name="ray-watch"):
             yield
     finally:
-        signal.signal(signal.SIGUSR1, before)
+        signal.signal(signal.SIGUSR1, before or signal.SIG_DFL)
 
 
 def _interrupt(*_: object) -> None:
@@ -183,10 +186,18 @@ class _Watch:
     """Looks after the servers of the Ray that this process has started."""
 
     def __init__(self) -> None:
-        self._kin = _family()
-        self._servers = {child.name(): child for child in self._kin if child.name() in _SERVERS}
+        self._kin: list[psutil.Process] = []
+        self._servers: dict[str, psutil.Process] = {}
         self.lost = ""
         self.over = False
+
+    def find(self) -> None:
+        """Look for what has been started."""
+        self._kin = _family()
+        for child in self._kin:
+            with suppress(psutil.Error):  # it has ended by now
+                if child.name() in _SERVERS:
+                    self._servers[child.name()] = child
 
     @property
     def message(self) -> str:

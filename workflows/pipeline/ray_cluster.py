@@ -49,11 +49,7 @@ def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
 @contextmanager
 def ray_cluster() -> Iterator[None]:
     """A connected Ray; one that was started here is stopped at the end."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    if (
-        not on_cluster() and "ray" not in sys.modules
-    ):  # Ray's default here; it reads it at its import, and warns without
-        os.environ.setdefault("RAY_AUTH_MODE", "token")
+    _set_defaults()
     import ray
 
     if ray.is_initialized():
@@ -61,6 +57,20 @@ def ray_cluster() -> Iterator[None]:
         return
     with _joined() if on_cluster() else own_ray():
         yield
+
+
+def worker_count() -> int:
+    """Tasks that a Ray of our own runs at a time: the CPUs of this machine, or of the container that it runs in."""
+    _set_defaults()
+    from ray._private.utils import get_num_cpus
+
+    return max(1, int(get_num_cpus(override_docker_cpu_warning=True)))
+
+
+def _set_defaults() -> None:
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    if not on_cluster() and "ray" not in sys.modules:  # its default here; it reads it at its import, and warns without
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
 
 
 @contextmanager

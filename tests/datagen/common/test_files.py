@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.common.errors import UnsafeFileError
-from datagen.common.files import lock_within, read_bounded, resolve_within
+from datagen.common.files import lock_within, read_bounded, refuse_links_out, resolve_within
 
 
 @pytest.mark.parametrize("name", ["", ".", "/etc/hostname", "../secret", "a/../../secret", "a\0b", "..\\secret"])
@@ -24,6 +24,14 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     for name in ("file", "below/secret", "below/not-there"):
         with pytest.raises(UnsafeFileError, match="link"):
             resolve_within(tmp_path / "folder", name)
+
+
+def test_links_out_of_a_folder_are_refused_with_what_else_to_do_but_for_those_that_are_named(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "x").symlink_to(tmp_path)
+    refuse_links_out(tmp_path / "folder", but=("x",))
+    with pytest.raises(UnsafeFileError, match=rf"link the whole folder {tmp_path}/folder instead .*; else remove it"):
+        refuse_links_out(tmp_path / "folder", but=("y",))
 
 
 def test_a_link_that_leads_to_itself_is_refused(tmp_path: Path) -> None:

@@ -93,3 +93,8 @@ def test_sampling_goes_on_where_it_was_and_never_stops_the_work(tmp_path: Path, 
     with caplog.at_level(logging.WARNING), sampling(tmp_path / "file" / "system.jsonl", every=0.02):
         pass
     assert "no longer noted" in caplog.text
+    caplog.clear()
+    (tmp_path / "run" / "system.jsonl").mkdir(parents=True)
+    with caplog.at_level(logging.WARNING), sampling(tmp_path / "run" / "system.jsonl", every=0.02):
+        pass
+    assert "no longer noted" in caplog.text and "is not a regular file" in caplog.text

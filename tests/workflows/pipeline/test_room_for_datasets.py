@@ -11,12 +11,14 @@ import pytest
 
 from datagen import sizes
 from datagen.common.errors import RecipeError
+from datagen.common.resources import free_disk
 from tests.support.recipes import tiny_dataset
 from workflows import full
 from workflows.cli import main as cli
 from workflows.pipeline import data_size
 from workflows.pipeline.console import guarded
 from workflows.pipeline.data_size import announce_size
+from workflows.pipeline.ray_cluster import worker_count
 from workflows.sweep.plan import plan_sweep
 
 Printed = pytest.CaptureFixture[str]
@@ -109,10 +111,38 @@ def test_memory_is_asked_for_the_workers_that_this_machine_has_at_work(
         return SimpleNamespace(meshes=meshes)
 
     monkeypatch.setattr(data_size, "size_of", size)
-    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr(data_size, "worker_count", lambda: 64)
     monkeypatch.setenv("RAY_ADDRESS", address)
     announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True, local=local)
     assert max(asked) == workers
+
+
+@pytest.mark.parametrize(("container", "workers"), [(None, 64), (8.0, 8), (0.5, 1)])
+def test_in_a_container_memory_is_asked_for_the_workers_that_it_may_have(
+    monkeypatch: pytest.MonkeyPatch, container: float | None, workers: int
+) -> None:
+    from ray._private import utils
+
+    monkeypatch.delenv("RAY_USE_MULTIPROCESSING_CPU_COUNT", raising=False)
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("multiprocessing.cpu_count", lambda: 64)
+    monkeypatch.setattr(utils, "_get_docker_cpus", lambda: container)
+    assert worker_count() == workers
+
+
+def test_workers_that_memory_has_no_room_for_may_be_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(data_size, "RAY_FROM_MESHES", 1)
+    monkeypatch.setattr(data_size, "worker_count", lambda: 10**9)
+    with pytest.raises(RecipeError, match=r"Lower .*, or work in one process: --local, where the command has it"):
+        announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True)
+
+
+def test_the_disk_of_a_link_is_where_it_leads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "other" / "not-yet")
+    asked: list[Path] = []
+    monkeypatch.setattr("shutil.disk_usage", lambda path: asked.append(path) or SimpleNamespace(free=7))
+    assert free_disk(tmp_path / "out" / "x.zarr") == 7 and asked == [tmp_path / "other"]
 
 
 def test_a_grid_of_a_hundred_million_trials_is_refused() -> None:

@@ -1,10 +1,14 @@
 """Little work is done in this process, much on Ray; what decides, what is said, and what happens where Ray fails."""
 
+import signal
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import psutil
 import pytest
+import ray
 
 from datagen.common.errors import ClusterError
 from datagen.generate import append, generate, inline
@@ -12,6 +16,7 @@ from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
 from workflows.cli.main import main
+from workflows.pipeline import own_ray as own_ray_module
 from workflows.pipeline import tasks
 from workflows.pipeline.own_ray import own_ray
 from workflows.pipeline.tasks import TaskRunner
@@ -128,7 +133,6 @@ def test_ray_that_does_not_start_at_first_is_given_more_time(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Ray waits 30 s for its node, by asking ``get_node`` until it answers; a busy machine may need longer."""
-    import ray
     from ray._private import services
 
     answers = iter([RuntimeError("not yet"), RuntimeError("not yet"), {"labels": {}}])
@@ -155,11 +159,46 @@ def test_ray_that_does_not_start_at_first_is_given_more_time(
     assert said == "Ray did not start (The current node timed out during startup.); once more, with more time\n"
 
 
+@pytest.mark.parametrize("fault", ["interrupted", "looking fails"])
+def test_whatever_ends_the_start_of_ray_nothing_of_it_is_left(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    ended: list[str] = []
+    monkeypatch.setattr(ray, "init", lambda **_: _raise(KeyboardInterrupt) if fault == "interrupted" else None)
+    monkeypatch.setattr(own_ray_module, "_family", lambda: _raise(LookupError))
+    monkeypatch.setattr(own_ray_module, "_end_processes", lambda: ended.append(fault))
+    with pytest.raises(KeyboardInterrupt if fault == "interrupted" else LookupError), own_ray():
+        pytest.fail("the block must not run")
+    assert ended == [fault]
+
+
+def test_a_process_that_ends_while_it_is_looked_at_and_handlers_that_are_not_pythons(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    child = subprocess.Popen(["true"])
+    gone = psutil.Process(child.pid)
+    child.wait()
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGUSR1)
+    set_signal = signal.signal
+    monkeypatch.setattr(ray, "init", lambda **_: None)
+    monkeypatch.setattr(own_ray_module, "_family", lambda: [gone])
+    try:
+        with monkeypatch.context() as foreign:
+            foreign.setattr(signal, "getsignal", lambda _: None)
+            foreign.setattr(signal, "signal", lambda number, handler: (set_signal(number, handler), None)[1])
+            with own_ray():
+                pass
+        assert signal.getsignal(signal.SIGTERM) == signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        signal.signal(signal.SIGUSR1, before[1])
+
+
+def _raise(error: type[BaseException]) -> None:
+    raise error
+
+
 def test_ray_that_does_not_start_at_all_is_one_line_with_what_else_to_do(
     tmp_path: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import ray
-
     def init(**options: Any) -> None:
         raise TimeoutError("Timed out after 30 seconds")
 
