@@ -1,4 +1,4 @@
-"""Sequences of meshes: the files of a numbered series, and one animated GLB of many frames."""
+"""Sequences of meshes: files of frames, and one animated GLB of many frames."""
 
 import re
 from collections.abc import Iterable
@@ -10,18 +10,15 @@ from numpy.typing import NDArray
 from datagen.common.errors import MeshError
 from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
 from datagen.mesh.formats import FORMATS
-from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT, require_known
+from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT
 
 INTERPOLATIONS = ("LINEAR", "STEP")
 
 
 def frames_of(path: str | Path) -> list[Path]:
-    """Return the mesh files of a folder, of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``), or of a file's series.
+    """Return the mesh files of a folder, or of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``).
 
-    The series of a numbered file are the files beside it that differ from it in that number alone.
-
-    In natural order: 2 before 10. A folder or pattern with mesh files of several formats is refused, for they would
-    take turns. A file without a number is a series of one.
+    In natural order: 2 before 10. Mesh files of several formats are refused, for they would take turns.
 
     Raises
     ------
@@ -31,8 +28,6 @@ def frames_of(path: str | Path) -> list[Path]:
     path = Path(path)
     if path.is_dir():
         found = [each for each in path.iterdir() if _is_mesh(each)]
-    elif path.is_file():
-        found = _series(path)
     elif is_pattern(path):
         name = _NUMBER.sub("[0-9]*", path.name)
         found = [each for each in path.parent.glob(name) if _is_mesh(each)] if path.parent.is_dir() else []
@@ -56,16 +51,6 @@ _NUMBER = re.compile(r"%\d*d|#+")
 
 def _is_mesh(path: Path) -> bool:
     return path.suffix.lower() in FORMATS and not path.name.startswith(".") and path.is_file()
-
-
-def _series(path: Path) -> list[Path]:
-    """Files beside one that differ from it in its last number alone."""
-    require_known(path)
-    parts = re.fullmatch(r"(.*?)(\d+)(\D*)", path.stem)
-    if not parts:
-        return [path]
-    alike = re.compile(re.escape(parts[1]) + r"\d+" + re.escape(parts[3] + path.suffix))
-    return [each for each in path.parent.iterdir() if alike.fullmatch(each.name) and _is_mesh(each)]
 
 
 def _natural(path: Path) -> tuple[list[tuple[int, int | str]], str]:

@@ -1,8 +1,7 @@
 """Where a mesh is unlike what a network was trained on, in words that say what to do.
 
-What the network saw is noted in the run when training begins, and goes into the registry with its weights. For runs
-that noted nothing it is asked of the dataset that they name, while it is still where it was; other weights are judged
-by what holds for any.
+What the network saw is noted in the run when training begins, and goes into the registry with its weights; weights
+without a note are judged by what holds for any.
 """
 
 from collections.abc import Iterator
@@ -60,12 +59,9 @@ def noted(seen: Seen) -> dict[str, Any]:
 def seen_by(weights: Path) -> Seen | None:
     """What the network of a run saw, None where it cannot be had; ``weights`` is a checkpoint's folder or file."""
     try:
-        about = _provenance(weights)
-        seen = about.get("seen")
-        if seen is None and "seen" in about:
-            return None
-        return _from_note(seen) if seen is not None else _seen_at(about["dataset"]["url"])
-    except (OSError, OverflowError, ValueError, TypeError, KeyError, DsffnetError):  # half a dataset or note is none
+        note = _provenance(weights).get("seen")
+        return _from_note(note) if note is not None else None
+    except (OSError, OverflowError, ValueError, TypeError, KeyError, DsffnetError):  # half a note is none
         return None
 
 
@@ -82,12 +78,6 @@ def _provenance(weights: Path) -> Provenance:
 def _from_note(note: dict[str, Any]) -> Seen:
     fewest, most = note["vertices"]
     return Seen((int(fewest), int(most)), *np.array(note["proportions"], np.float64).reshape(2, 3))
-
-
-def _seen_at(url: str) -> Seen | None:
-    from datagen.store import open_dataset  # it brings zarr, which a transfer does not need otherwise
-
-    return seen_in(open_dataset(url)) if Path(url).is_dir() else None
 
 
 def _some_poses(dataset: "Dataset", identity: int) -> Floats:

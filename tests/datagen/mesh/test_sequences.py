@@ -149,15 +149,12 @@ def test_what_cannot_be_an_animation_leaves_nothing(tmp_path: Path, monkeypatch:
         write_animation(read, frames, tmp_path / "file" / "moving.glb", frames_per_second=10)
 
 
-def test_frames_in_natural_order_from_a_folder_a_pattern_or_one_of_them(tmp_path: Path) -> None:
+def test_frames_in_natural_order_from_a_folder_or_a_pattern(tmp_path: Path) -> None:
     names = [f"walk_{number}.obj" for number in (1, 2, 10, 11)]
     for name in [*reversed(names), "rest_1.obj", "notes.txt", ".hidden.obj"]:
         (tmp_path / name).write_text("x")
     assert [path.name for path in frames_of(tmp_path)] == ["rest_1.obj", *names]
     assert [path.name for path in frames_of(tmp_path / "walk_*.obj")] == names
-    assert [path.name for path in frames_of(tmp_path / "walk_10.obj")] == names
-    (tmp_path / "plain.obj").write_text("x")
-    assert [path.name for path in frames_of(tmp_path / "plain.obj")] == ["plain.obj"]
 
 
 def test_places_without_frames(tmp_path: Path) -> None:
@@ -167,9 +164,6 @@ def test_places_without_frames(tmp_path: Path) -> None:
         frames_of(tmp_path / "*.obj")
     with pytest.raises(MeshError, match="no mesh file or folder at"):
         frames_of(tmp_path / "none")
-    (tmp_path / "a.txt").write_text("x")
-    with pytest.raises(MeshError, match="unknown mesh format"):
-        frames_of(tmp_path / "a.txt")
     for name in ("1.obj", "2.ply"):
         (tmp_path / name).write_text("x")
     with pytest.raises(MeshError, match="several formats"):

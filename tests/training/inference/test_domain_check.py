@@ -9,8 +9,6 @@ import pytest
 from datagen.generate import generate
 from datagen.mesh.geometry import Mesh
 from tests.support.recipes import tiny_dataset, tiny_training
-from tests.support.workflows import untrained_run
-from training.checkpoints.checkpoint import require_checkpoint
 from training.inference.domain_check import Seen, noted, part_sizes, remarks, seen_by
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation
 from workflows.pipeline.train import write_head
@@ -100,19 +98,6 @@ def test_proportions_and_vertex_counts_beyond_training() -> None:
     assert "A has 240 vertices, training saw 5,000" in told(BODY, seen=Seen((5000, 5000), SEEN.least, SEEN.most))
 
 
-def test_what_a_run_saw_is_asked_of_its_dataset_while_it_is_there(tmp_path: Path) -> None:
-    data = tmp_path / "leg.zarr"
-    generate(tiny_dataset(), str(data))
-    weights = require_checkpoint(untrained_run(tmp_path / "run")).path
-    (tmp_path / "run" / "provenance.json").write_text(json.dumps({"dataset": {"url": str(data)}}))
-    seen = seen_by(weights)
-    assert seen is not None and seen.vertices == (32, 32)
-    assert (seen.least <= seen.most).all() and seen.most.max() == 1
-    assert seen_by(tmp_path / "elsewhere" / "weights.safetensors") is None
-    data.rename(tmp_path / "moved.zarr")
-    assert seen_by(weights) is None
-
-
 def test_what_a_run_noted_needs_no_dataset(tmp_path: Path) -> None:
     checkpoint = tmp_path / "run" / "checkpoints" / "step-00000004"
     checkpoint.mkdir(parents=True)
@@ -123,6 +108,7 @@ def test_what_a_run_noted_needs_no_dataset(tmp_path: Path) -> None:
     assert seen.least.tolist() == list(SEEN.least) and seen.most.tolist() == list(SEEN.most)
     (tmp_path / "run" / "provenance.json").write_text(json.dumps(about | {"seen": {"vertices": 3}}))
     assert seen_by(checkpoint) is None, "half a note is none, and no traceback"
+    assert seen_by(tmp_path / "elsewhere" / "weights.safetensors") is None
 
 
 def test_a_training_notes_its_bodies_such_that_none_of_them_is_warned_of(tmp_path: Path) -> None:
