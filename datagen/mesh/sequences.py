@@ -12,8 +12,6 @@ from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
 from datagen.mesh.formats import FORMATS
 from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT
 
-INTERPOLATIONS = ("LINEAR", "STEP")
-
 
 def frames_of(path: str | Path) -> list[Path]:
     """Return the mesh files of a folder, or of a pattern (``*.obj``, ``%04d.obj``, ``##.obj``).
@@ -79,12 +77,11 @@ def write_animation(
     out: Path,
     *,
     frames_per_second: float,
-    interpolation: str = "LINEAR",
 ) -> None:
     """Write frames [frame, n, 3] of a mesh as one GLB with an animation; the file appears whole or not at all.
 
-    Frame k is a morph target, the difference from frame 0, and shows alone at k / ``frames_per_second`` seconds; LINEAR
-    moves vertices straight from one to the next, STEP jumps. Materials, textures and texture coordinates are the
+    Frame k is a morph target, the difference from frame 0, and shows alone at k / ``frames_per_second`` seconds;
+    between them vertices move straight from one to the next. Materials, textures and texture coordinates are the
     original's; normals move along, so a file that has none becomes smooth. Frames may be made one by one: in memory are
     one frame and frames x frames weights of four bytes, the rest waits on disk (24 bytes a vertex and frame, as in the
     file).
@@ -95,8 +92,8 @@ def write_animation(
     Raises
     ------
     MeshError
-        ``out`` is no .glb, no frame or too many, frames that are not the mesh's in shape or not finite, or a rate or
-        interpolation that cannot be.
+        ``out`` is no .glb, no frame or too many, frames that are not the mesh's in shape or not finite, or a rate that
+        is none.
     StorageError
         The file could not be written.
     """
@@ -105,8 +102,6 @@ def write_animation(
         raise MeshError(f"{out}: an animation is a .glb file, not {out.suffix!r}")
     if not (np.isfinite(frames_per_second) and frames_per_second > 0):
         raise MeshError(f"frames per second must be above 0, not {frames_per_second}")
-    if interpolation not in INTERPOLATIONS:
-        raise MeshError(f"interpolation {interpolation!r} is none of {', '.join(INTERPOLATIONS)}")
     check_writable(out)
     sound = (usable(original, frame) for frame in frames)
-    draft_of(original).animated(sound, out, frames_per_second=frames_per_second, interpolation=interpolation)
+    draft_of(original).animated(sound, out, frames_per_second=frames_per_second)

@@ -124,9 +124,7 @@ class Draft:
                 primitive["attributes"] |= added
         return self.parts
 
-    def animated(
-        self, frames: Iterable[NDArray[np.float64]], out: Path, *, frames_per_second: float, interpolation: str
-    ) -> None:
+    def animated(self, frames: Iterable[NDArray[np.float64]], out: Path, *, frames_per_second: float) -> None:
         """Write the file with frames [frame, n, 3] as an animation."""
         iterator = iter(frames)
         first = next(iterator, None)
@@ -137,7 +135,7 @@ class Draft:
         with atomic_file(out) as file, tempfile.TemporaryFile(dir=out.parent) as spool:
             targets = self._spooled(iterator, base, spool)
             if targets:
-                self._animate(len(targets), targets, spool.tell(), frames_per_second, interpolation)
+                self._animate(len(targets), targets, spool.tell(), frames_per_second)
             size = parts.length + spool.tell()
             if size > GLB_LIMIT:
                 raise MeshError(
@@ -164,14 +162,14 @@ class Draft:
                 bounds[-1].append([(each.min(axis=0).tolist(), each.max(axis=0).tolist()) for each in moves])
         return bounds
 
-    def _animate(self, count: int, bounds: list[Any], size: int, frames_per_second: float, interpolation: str) -> None:
+    def _animate(self, count: int, bounds: list[Any], size: int, frames_per_second: float) -> None:
         times = (np.arange(count + 1) / frames_per_second).astype(np.float32)[:, None]
         ends: dict[str, Any] = {"min": [0.0], "max": [float(times[-1, 0])]}
         weights = np.eye(count + 1, count, -1, np.float32).reshape(-1, 1)  # frame k shows target k - 1 alone
         sampler = {
             "input": self.parts.accessor(times, view=self.parts.view(times.tobytes()), **ends),
             "output": self.parts.accessor(weights, view=self.parts.view(weights.tobytes())),
-            "interpolation": interpolation,
+            "interpolation": "LINEAR",
         }
         views = self.parts.json["bufferViews"]
         views.append({"buffer": 0, "byteOffset": self.parts.length, "byteLength": size, "byteStride": 12,

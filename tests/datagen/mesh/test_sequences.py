@@ -31,8 +31,7 @@ def shown(path: Path, seconds: float) -> list[tuple[NDArray[Any], NDArray[Any]]]
     times, table = file.accessor(sampler["input"])[:, 0], file.accessor(sampler["output"])
     table = table.reshape(len(times), -1)
     weights = np.array([np.interp(seconds, times, column) for column in table.T])
-    if sampler["interpolation"] == "STEP":
-        weights = table[np.searchsorted(times, seconds, side="right") - 1]
+    assert sampler["interpolation"] == "LINEAR"
     node = channel["target"]["node"]
     found = []
     for piece in file.json["meshes"][file.nodes[node]["mesh"]]["primitives"]:
@@ -51,19 +50,17 @@ def moves(read: MeshFile, count: int) -> NDArray[np.float64]:
     return read.mesh.vertices + swing
 
 
-@pytest.mark.parametrize("interpolation", ["LINEAR", "STEP"])
-def test_each_frame_is_shown_at_its_time(tmp_path: Path, interpolation: str) -> None:
+def test_each_frame_is_shown_at_its_time(tmp_path: Path) -> None:
     read = read_mesh_file(scene().save(tmp_path / "scene.glb"))
     frames = moves(read, 6)
-    write_animation(read, frames, tmp_path / "moving.glb", frames_per_second=25, interpolation=interpolation)
+    write_animation(read, frames, tmp_path / "moving.glb", frames_per_second=25)
     sound(tmp_path / "moving.glb")
     for number, frame in enumerate(frames):
         for positions, normals in shown(tmp_path / "moving.glb", number / 25 + (1e-7 if number else 0)):
             assert np.allclose(positions, frame, atol=1e-4)
             assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
     between = shown(tmp_path / "moving.glb", 1.5 / 25)[0][0]
-    expected = (frames[1] + frames[2]) / 2 if interpolation == "LINEAR" else frames[1]
-    assert np.allclose(between, expected, atol=1e-4)
+    assert np.allclose(between, (frames[1] + frames[2]) / 2, atol=1e-4)
     assert trimesh.load_scene(tmp_path / "moving.glb").geometry
 
 
@@ -133,8 +130,6 @@ def test_what_cannot_be_an_animation_leaves_nothing(tmp_path: Path, monkeypatch:
         write_animation(read, frames, out.with_suffix(".obj"), frames_per_second=10)
     with pytest.raises(MeshError, match="above 0, not 0"):
         write_animation(read, frames, out, frames_per_second=0)
-    with pytest.raises(MeshError, match="'SOFT' is none of LINEAR, STEP"):
-        write_animation(read, frames, out, frames_per_second=1, interpolation="SOFT")
     with pytest.raises(KeyboardInterrupt):
         write_animation(read, failing(), out, frames_per_second=10)
     monkeypatch.setattr(mesh_glb_written, "FRAME_LIMIT", 2)
