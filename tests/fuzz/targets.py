@@ -166,9 +166,10 @@ def _synced(tree: Path) -> None:
 
 
 def _stages(tree: Path) -> None:
-    from workflows.pipeline.stage import Stage, refuse_other_kind, run_stage
+    from workflows.pipeline.run_folder import SingleRunFolder
+    from workflows.pipeline.stage import Stage, run_stage
 
-    refuse_other_kind(tree, "workflow")
+    SingleRunFolder(tree).require_kind()
     stage = Stage("generate", depends_on="data", intact=lambda: True, work=lambda: None)
     run_stage(stage, out=tree, before=lambda: None)
     assert not run_stage(stage, out=tree, before=lambda: None), (
