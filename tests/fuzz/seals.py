@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.support.hostile import sealed
 
 from datagen.common.errors import DsffnetError
 from datagen.grid import shard_path
+from tests.support.damage.datasets import sealed
 
 _LARGEST = 2**24  # bytes of a file that is looked into
 
