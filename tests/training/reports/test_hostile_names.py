@@ -22,8 +22,8 @@ import yaml
 from datagen.common.errors import MeshError
 from datagen.common.printable import printable, printable_lines
 from datagen.store import open_dataset
-from tests.support.pages import Elements
 from tests.support.recipes import tiny_training
+from tests.support.reports.pages import Elements
 from tests.support.workflows import finished_workflow, rows_on
 from training.evaluation.document import Table, Text, document_markdown, plain, table_markdown
 from training.evaluation.generalisation import GeneralisationRow

@@ -11,7 +11,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from datagen.common.errors import CheckpointError
-from tests.support.pictures import caught, octahedron, pixels
+from tests.support.reports.pictures import caught, octahedron, pixels
 from training.evaluation.evaluate import Row
 from training.evaluation.run_curves import RunCurve
 from training.reports.plots import ablation, convergence, sweep, training_curve

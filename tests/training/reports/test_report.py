@@ -11,7 +11,7 @@ from urllib.parse import unquote
 import pytest
 
 from datagen.common.errors import StorageError
-from tests.support.pages import Elements
+from tests.support.reports.pages import Elements
 from training.evaluation.document import markdown as markdown_of
 from training.reports.markup import markup_html
 from training.reports.report import (

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh
-from tests.support.pictures import caught, octahedron, pixels
+from tests.support.reports.pictures import caught, octahedron, pixels
 from training.viz import comparison_figure as module
 from training.viz.close_up import CloseUp
 from training.viz.comparison_figure import comparison_figure

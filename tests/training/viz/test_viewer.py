@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.pages import Elements
+from tests.support.reports.pages import Elements
 from training.viz.transfer_example import Comparison, ErrorScale, placed
 from training.viz.transfer_picture import NamedMesh
 from training.viz.viewer import decode_positions, viewer_payload, write_viewer
