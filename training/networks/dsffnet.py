@@ -147,7 +147,7 @@ class ResidualBlock(nn.Module):
     def forward(self, active: Tensor, vertices: Tensor, probe: Tensor) -> tuple[Tensor, Tensor]:
         """Return, after the first FFAdaIN and ReLU, the first summand without bias and what the second layer acts on.
 
-        The rest is left to what follows the block, which has cheaper ways of doing it (see `_joined`). Without
+        The rest is left to what follows the block, which has cheaper ways of doing it (see `joined`). Without
         gradients, the place of `active` in memory is used again.
         """
         active = centred_for_autocast(active)
@@ -180,21 +180,21 @@ class Decoder(nn.Module):
         vertices = homogeneous(target)
         with full_precision(target):
             probe = pose_probe(latent)
-            active = self._lifted(target, vertices, probe)
+            active = self.lifted(target, vertices, probe)
         for block, following, norm in (
             (self.block1, self.linear2, self.block2.norm1),
             (self.block2, self.linear3, self.block3.norm1),
         ):
             first, second = block(active, vertices, probe)
             modulate = rounded_modulated_relu if norm is self.block2.norm1 else modulated_relu
-            joined = _joined(first, second, block.linear2.weight, following.weight)
-            active = modulate(joined, vertices, *norm(probe), room=joined)
-            del joined
+            merged = joined(first, second, block.linear2.weight, following.weight)
+            active = modulate(merged, vertices, *norm(probe), room=merged)
+            del merged
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
             first, second = self.block3(active, vertices, probe)
             return 2 * torch.tanh(self._lowered(first, second))
 
-    def _lifted(self, target: Tensor, vertices: Tensor, probe: Tensor) -> Tensor:
+    def lifted(self, target: Tensor, vertices: Tensor, probe: Tensor) -> Tensor:
         """Return the first layer, FFAdaIN and ReLU: ``IN(h) sigma + mu`` is quadratic in the coordinates."""
         scale, shift = self.block1.norm1(probe)
         centred = centred_features(target)
@@ -208,11 +208,11 @@ class Decoder(nn.Module):
     def _lowered(self, first: Tensor, second: Tensor) -> Tensor:
         """Return the end of the last block and the last layer; here no norm follows, and biases count."""
         inner = self.block3.linear1.bias + self.block3.linear2.bias
-        moved = _joined(first, second, self.block3.linear2.weight, self.out.weight)
+        moved = joined(first, second, self.block3.linear2.weight, self.out.weight)
         return moved + (self.out.weight @ inner + self.out.bias)
 
 
-def _joined(first: Tensor, second: Tensor, weight: Tensor, following: Tensor) -> Tensor:
+def joined(first: Tensor, second: Tensor, weight: Tensor, following: Tensor) -> Tensor:
     """Return ``following @ (first + weight @ second)``; if it narrows, merging the two matrices is cheaper."""
     if following.shape[0] < following.shape[1]:
         return _sum_with(nn.functional.linear(first, following), second, following @ weight)

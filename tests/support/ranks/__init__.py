@@ -73,15 +73,3 @@ def finish(ranks: list[subprocess.Popen[str]], *, timeout: float = 120) -> list[
         for process in ranks:
             process.kill()
             process.wait()
-
-
-if __name__ == "__main__":
-    import torch.distributed
-
-    from training.engine.trainer import train
-
-    torch.distributed.init_process_group("gloo")
-    for values, data, run in json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")):
-        train(TrainingRecipe.model_validate(values), data=data, run=Path(run))
-    torch.distributed.barrier()
-    os._exit(0)

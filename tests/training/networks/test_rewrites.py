@@ -10,7 +10,7 @@ from torch.nn.functional import conv1d, instance_norm, linear
 from tests.literal.corenet3d import LiteralElaIN
 from tests.literal.dsffnet import LiteralNorm
 from tests.support.three_networks import lively, meshes
-from training.networks.dsffnet import DSFFNet, _joined
+from training.networks.dsffnet import DSFFNet, joined
 from training.networks.layers import modulation
 from training.networks.layers.elain import ElaIN, Generator, Identity, centred
 from training.networks.layers.modulation import (
@@ -90,14 +90,14 @@ def test_dsffnets_first_layer_norm_and_relu_are_quadratic_in_the_coordinates() -
     scale, shift = decoder.block1.norm1(probe)
     vertices = homogeneous(target)
     expected = torch.relu(_by_channel(decoder.lift(target)) * (vertices @ scale) + vertices @ shift)
-    torch.testing.assert_close(decoder._lifted(target, vertices, probe), expected, **EXACT)
+    torch.testing.assert_close(decoder.lifted(target, vertices, probe), expected, **EXACT)
 
 
 @pytest.mark.parametrize("outputs", [3, 6, 9])
 def test_a_blocks_last_layer_merges_with_the_next(outputs: int) -> None:
     first, second, weight, following = (torch.randn(s) for s in ((2, 7, 6), (2, 7, 6), (6, 6), (outputs, 6)))
     torch.testing.assert_close(
-        _joined(first, second, weight, following), (first + second @ weight.t()) @ following.t(), **EXACT
+        joined(first, second, weight, following), (first + second @ weight.t()) @ following.t(), **EXACT
     )
 
 
@@ -115,7 +115,7 @@ def test_elain_is_two_affine_maps_of_the_identity_feature_a_mesh() -> None:
 
 def test_3d_corenets_wide_convolution_and_the_next_layer_are_one_map_of_nine_numbers() -> None:
     generator, warped = Generator((12, 8, 6), 4), _mesh(10)
-    found = generator._lifted(warped)
+    found = generator.lifted(warped)
     weight = generator.lift.weight.view(12, 3, 3)
     lifted = conv1d(warped.transpose(1, 2), weight, generator.lift.bias, padding=1).transpose(1, 2)
     expected = linear(lifted, generator.linear1.weight, generator.linear1.bias)

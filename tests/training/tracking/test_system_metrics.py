@@ -20,39 +20,34 @@ def test_load_under_the_names_of_mlflow(tmp_path: Path) -> None:
     assert all(key.startswith("system/") and isinstance(value, float) for key, value in found.items())
 
 
-def test_gpus_by_pynvml(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = types.SimpleNamespace(used=2e9, total=8e9)
-    nvml = types.SimpleNamespace(
+class NVMLError(Exception):
+    pass
+
+
+def nvml(*use: float | None) -> types.SimpleNamespace:
+    """A driver's library with GPUs of such use; None: of one that does not tell it."""
+
+    def rates(gpu: int) -> types.SimpleNamespace:
+        if use[gpu] is None:
+            raise NVMLError("Not Supported")
+        return types.SimpleNamespace(gpu=use[gpu])
+
+    return types.SimpleNamespace(
         nvmlInit=lambda: None,
-        nvmlDeviceGetCount=lambda: 2,
+        nvmlDeviceGetCount=lambda: len(use),
         nvmlDeviceGetHandleByIndex=lambda index: index,
-        nvmlDeviceGetMemoryInfo=lambda handle: memory,
-        nvmlDeviceGetUtilizationRates=lambda handle: types.SimpleNamespace(gpu=50 + handle),
-        NVMLError=RuntimeError,
-    )
-    monkeypatch.setitem(sys.modules, "pynvml", nvml)
-    found = gpu_reader()()
-    assert found["gpu_1_utilization_percentage"] == 51 and found["gpu_0_memory_usage_megabytes"] == 2000
-    assert found["gpu_1_memory_usage_percentage"] == 25 and len(found) == 6
-
-
-def test_what_a_gpu_does_not_tell_is_left_out_and_the_rest_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    class NVMLError(Exception):
-        pass
-
-    def unsupported(handle: int) -> None:
-        raise NVMLError("Not Supported")
-
-    nvml = types.SimpleNamespace(
-        nvmlInit=lambda: None,
-        nvmlDeviceGetCount=lambda: 1,
-        nvmlDeviceGetHandleByIndex=lambda index: index,
-        nvmlDeviceGetMemoryInfo=lambda handle: types.SimpleNamespace(used=1e9, total=4e9),
-        nvmlDeviceGetUtilizationRates=unsupported,
+        nvmlDeviceGetMemoryInfo=lambda handle: types.SimpleNamespace(used=2e9, total=8e9),
+        nvmlDeviceGetUtilizationRates=rates,
         NVMLError=NVMLError,
     )
-    monkeypatch.setitem(sys.modules, "pynvml", nvml)
-    assert gpu_reader()() == {"gpu_0_memory_usage_megabytes": 1000, "gpu_0_memory_usage_percentage": 25}
+
+
+def test_gpus_by_pynvml_and_what_one_does_not_tell_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", nvml(50, 51, None))
+    found = gpu_reader()()
+    assert found["gpu_1_utilization_percentage"] == 51 and found["gpu_0_memory_usage_megabytes"] == 2000
+    assert found["gpu_1_memory_usage_percentage"] == 25 and len(found) == 8
+    assert "gpu_2_utilization_percentage" not in found and found["gpu_2_memory_usage_percentage"] == 25
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ class Generator(nn.Module):
     def forward(self, warped: Tensor, identity: Tensor) -> Tensor:
         """Return ``[b, n, 3]`` for warped points ``[b, n, 3]`` and the target's features ``[b, n, k]``."""
         with full_precision(warped):
-            side, features = Identity.of(identity), self._lifted(warped)
+            side, features = Identity.of(identity), self.lifted(warped)
         for block, following in ((self.block1, self.linear2), (self.block2, self.linear3)):
             hidden, bias = block.followed_by(following, *block(features, side))
             with full_precision(warped):
@@ -204,7 +204,7 @@ class Generator(nn.Module):
             moved, bias = self.block3.followed_by(self.out, skipped, inner)
             return 2 * torch.tanh(moved + bias)
 
-    def _lifted(self, warped: Tensor) -> Centred:
+    def lifted(self, warped: Tensor) -> Centred:
         """Return the first two layers' output: one linear map of nine numbers, so that centring those centres it."""
         weight = self.linear1.weight @ self.lift.weight
         bias = self.linear1.weight @ self.lift.bias + self.linear1.bias
