@@ -23,7 +23,7 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One way to spoil a source, and how much of it is tried.
+    """One way to disturb a source, and how much of it is tried.
 
     Attributes
     ----------

@@ -126,6 +126,19 @@ def triples_in(rows: Iterable[Row]) -> int:
     return len({(row.pose_type, row.triple) for row in rows})
 
 
+def require_distinct(names: Sequence[str]) -> None:
+    """Refuse methods that tables could not tell apart.
+
+    Raises
+    ------
+    EvaluationError
+        Two have one name.
+    """
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise EvaluationError(f"two methods are called {twice[0]!r}: give each a name of its own")
+
+
 def require_pairable(name: str, network: NetworkRecipe, source: int, target: int, *, where: str) -> None:
     """Refuse a network that pairs source and target by index for meshes of different counts.
 
@@ -162,10 +175,7 @@ class _Piece:
 
 
 def _contenders(methods: Sequence[Method], dataset: Dataset, recipe: EvaluationRecipe) -> list[Contender]:
-    names = [method.name for method in methods] + list(NO_OPS)
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise EvaluationError(f"two methods are called {twice[0]!r}: give each a name of its own")
+    require_distinct([*(method.name for method in methods), *NO_OPS])
     if not any(len(evaluation_list(dataset, recipe, pose_type)) for pose_type in POSE_TYPES):
         raise EvaluationError(
             f"{dataset.url} lists no evaluation triples. Make a dataset that does: --set data.triples.count=400, with "

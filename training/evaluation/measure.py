@@ -113,7 +113,7 @@ def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Gr
 
 
 def _measure_each(groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe) -> list[Score]:
-    """Metrics of each triple over its target's own vertices and faces; rows behind its count are padding."""
+    """Metrics of each triple over its target's own vertices and faces; rows after its count are padding."""
     found: dict[int, Score] = {}
     for its in groups:
         ours, right = output[its.places, : its.count], truth[its.places, : its.count]

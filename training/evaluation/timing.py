@@ -11,9 +11,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from datagen.common.errors import EvaluationError
 from training.data.batch import Batch
-from training.evaluation.evaluate import Method, require_pairable
+from training.evaluation.evaluate import Method, require_distinct, require_pairable
 from training.inference.predict import load_trained, predict
 
 _KIBIBYTE = 1024
@@ -93,8 +92,9 @@ def measure_inference(
     """
     if repeats < 1:
         raise ValueError(f"repeats must be positive, got {repeats}")
+    require_distinct([method.name for method in methods])
     pair = _random_pair(vertices) if isinstance(vertices, int) else _first_pair(vertices)
-    networks = {method.name: _loaded(method, pair).to(device) for method in _distinct(methods)}
+    networks = {method.name: _loaded(method, pair).to(device) for method in methods}
     with _threads(threads) as used:
         seconds = _interleaved(networks, pair.to(device), repeats=repeats, warm_up=warm_up)
     return {
@@ -113,14 +113,6 @@ def measure_inference(
         )
         for name, network in networks.items()
     }
-
-
-def _distinct(methods: Sequence[Method]) -> Sequence[Method]:
-    names = [method.name for method in methods]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise EvaluationError(f"two methods are called {twice[0]!r}: give each a name of its own")
-    return methods
 
 
 def _loaded(method: Method, pair: Batch) -> nn.Module:

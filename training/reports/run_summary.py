@@ -18,6 +18,7 @@ from datagen.common.json_files import read_json
 from training.evaluation.document import Table
 from training.reports.blocks import Block, Code, Facts, Section, shown
 from training.tracking.journal import read_journal
+from training.tracking.progress import duration as in_units
 from training.tracking.provenance import Provenance, provenance_of, this_commit, this_machine
 from training.tracking.record import Record, find_records, read_record
 
@@ -50,13 +51,8 @@ def moment(milliseconds: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people say them: 41 s, 6 min 42 s, 3 h 5 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s" if whole >= 10 else f"{seconds:.1f} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    """Seconds as people say them: 4.1 s, 41 s, 6 min 42 s, 3 h 5 min."""
+    return f"{seconds:.1f} s" if round(seconds) < 10 else in_units(seconds)
 
 
 def _facts(record: Record, out: Path) -> dict[str, str | int | float | Code]:

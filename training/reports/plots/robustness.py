@@ -1,4 +1,4 @@
-"""Curves of metrics over disturbances as small multiples, and pictures of spoilt sources and what comes of them."""
+"""Curves of metrics over disturbances as small multiples, and pictures of disturbed sources and their outputs."""
 
 import os
 from collections.abc import Sequence
@@ -114,8 +114,8 @@ def disturbance_picture(
     truth = case.truth.vertices
     sources = [disturbed(case, disturbance, amount) for disturbance, amount in chosen]
     reference = Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], "target")
-    spoilt = [Panel(_stood(source), ROLE_COLORS["source"], _count(source)) for source in sources]
-    page = [Row("source", [reference, *spoilt])]
+    changed = [Panel(_stood(source), ROLE_COLORS["source"], _count(source)) for source in sources]
+    page = [Row("source", [reference, *changed])]
     for number, method in enumerate(methods):
         whole = Panel(Mesh(standing(truth), case.truth.faces), ROLE_COLORS["truth"], "ground truth")
         panels: list[Panel | str] = ["" if number else whole]

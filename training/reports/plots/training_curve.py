@@ -125,7 +125,7 @@ def _draw_block(axes: Axes, block: str, curves: Sequence[_Curve]) -> None:
 
 
 def _label_ends(axes: Axes, curves: Sequence[_Curve], *, gap: float) -> None:
-    """Write each curve's name behind its end, moved where ends are close, with a hairline to the curve."""
+    """Write each curve's name after its end, moved where ends are close, with a hairline to the curve."""
     curves = sorted(curves, key=lambda curve: float(curve.values[-1]))
     places = apart(np.array([curve.values[-1] for curve in curves]), gap)
     for curve, place in zip(curves, places, strict=True):
