@@ -12,21 +12,17 @@ import logging
 import os
 import re
 import shlex
-import shutil
-import tempfile
 import threading
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from datagen.common.errors import DsffnetError, TrackingError
-from datagen.common.files import lock_within, read_within, resolve_within
+from datagen.common.files import lock_within
 from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
 from training.tracking.mlflow_store import prepare_store
-from training.tracking.record import ALIAS, EXPERIMENT, Record, Server, find_records, parent_of, read_record
+from training.tracking.model_registry import Registration
+from training.tracking.record import EXPERIMENT, Record, Server, find_records, parent_of, read_record
 from training.tracking.threads import background
 
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
@@ -37,7 +33,6 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 
 log = logging.getLogger(__name__)
-_ROOT = Path(__file__).parents[2]
 _PARENT_TAG, _RECORD_TAG, _WEIGHTS_TAG = "mlflow.parentRunId", "dsffnet.record", "dsffnet.weights"
 _METRICS_AT_ONCE, _PARAMETERS_AT_ONCE, _LONGEST_PARAMETER, _LONGEST_NAME = 900, 90, 5000, 250
 _LOCK_SECONDS = 120.0  # to wait for another process that publishes the same record, such as a sync by hand
@@ -238,67 +233,10 @@ class _Publication:
             self._note()
 
     def _register_model(self) -> None:
-        """Log and register the weights, unless a kill came between that and the note."""
         marks = {_RECORD_TAG: self._id, _WEIGHTS_TAG: self.record.model_version}
-        version = self._registered_version(marks)
-        if version is None:
-            source, model = self._logged_model(marks) or self._log_model(marks)
-            version = self._register_version(source, model, marks)
-        self.client.set_registered_model_alias(self.record.model, ALIAS, version)
-
-    def _registered_version(self, marks: dict[str, str]) -> str | None:
-        found = self.client.search_model_versions(f"run_id='{self.sent['run']}'")
-        same = [each for each in found if each.name == self.record.model and marks.items() <= each.tags.items()]
-        return str(same[0].version) if same else None
-
-    def _logged_model(self, marks: dict[str, str]) -> tuple[str, str] | None:
         experiment = _experiment(self.client, self.server)
-        found = self.client.search_logged_models([experiment], f"source_run_id = '{self.sent['run']}'")
-        same = [each for each in found if marks.items() <= each.tags.items()]
-        whole = [each for each in same if each.status == "READY"]
-        for part in same:
-            if part not in whole:
-                self.client.delete_logged_model(part.model_id)
-        return (f"models:/{whole[0].model_id}", whole[0].model_id) if whole else None
-
-    def _log_model(self, marks: dict[str, str]) -> tuple[str, str]:
-        import mlflow
-
-        from training.checkpoints.checkpoint import export_weights, require_checkpoint
-
-        checkpoint = require_checkpoint(self.folder, "result")
-        resolve_within(self.folder, os.path.relpath(checkpoint.path, self.folder))  # no other run's weights are sent
-        packages = [_ROOT / "training", _ROOT / "datagen"]
-        with tempfile.TemporaryDirectory() as temporary, _quiet_run(self.sent["run"]):
-            export_weights(checkpoint, Path(temporary) / "weights")
-            with suppress(FileNotFoundError):  # what bodies it learned from, for training.inference.domain_check
-                about = read_within(self.folder, "provenance.json")
-                (Path(temporary) / "weights" / "provenance.json").write_bytes(about)
-            code = [str(shutil.copytree(p, Path(temporary) / p.name, ignore=_NO_CACHES)) for p in packages]
-            model = mlflow.pyfunc.log_model(
-                name="model",
-                python_model=str(_ROOT / "training" / "inference" / "registered_model.py"),
-                artifacts={"weights": str(Path(temporary) / "weights")},
-                code_paths=code,
-                signature=_signature(),
-                pip_requirements=["torch", "safetensors", "numpy", "scipy", "pydantic", "filelock", "zarr", "trimesh"],
-                tags=marks,
-            )
-        return model.model_uri, model.model_id
-
-    def _register_version(self, source: str, model: str, marks: dict[str, str]) -> str:
-        """As log_model's own registration, which prints into the progress bars."""
-        from mlflow.exceptions import MlflowException
-
-        try:
-            self.client.create_registered_model(self.record.model)
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_ALREADY_EXISTS":
-                raise
-        version = self.client.create_model_version(
-            self.record.model, source, self.sent["run"], tags=marks, model_id=model
-        )
-        return str(version.version)
+        name = self.record.model or ""
+        Registration(self.client, experiment, self.sent["run"], self.folder, marks).register(name)
 
     def _send_status(self) -> None:
         if self.record.status == "RUNNING":
@@ -322,19 +260,6 @@ class _Publication:
         note_sent(self.folder, self.server.uri, self.sent)
 
 
-@contextmanager
-def _quiet_run(run: str) -> Iterator[None]:
-    """The fluent API's run, without its advice on type hints and input examples (there is a signature)."""
-    import mlflow
-
-    with warnings.catch_warnings(), mlflow.start_run(run_id=run):
-        warnings.simplefilter("ignore")
-        yield
-
-
-_NO_CACHES = shutil.ignore_patterns("__pycache__", "*.pyc", "node_modules")
-
-
 def _key(name: str) -> str:
     """A name of a metric, parameter or tag with what MLflow refuses in one replaced; folders may have given it."""
     parts = re.sub(r"[^/\w.\- :]", "_", name)[:_LONGEST_NAME].split("/")
@@ -350,19 +275,6 @@ def _experiment(client: Any, server: Server) -> str:
     if found is not None:
         return str(found.experiment_id)
     return str(client.create_experiment(EXPERIMENT, server.artifacts.as_uri() if server.artifacts else None))
-
-
-def _signature() -> Any:
-    import numpy as np
-    from mlflow.models import ModelSignature
-    from mlflow.types import ParamSchema, ParamSpec, Schema, TensorSpec
-
-    real, whole = np.dtype(np.float64), np.dtype(np.int64)
-    names = {"source": real, "target": real, "target_faces": whole}
-    inputs = Schema([TensorSpec(kind, (-1, 3), name) for name, kind in names.items()])
-    options = {"up": ("string", "Y"), "front": ("string", "Z"), "align": ("boolean", False), "refine": ("double", 0.0)}
-    params = ParamSchema([ParamSpec(name, *kind_and_default) for name, kind_and_default in options.items()])
-    return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]), params=params)
 
 
 class Mirror:

@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import psutil
 from pydantic import ConfigDict, TypeAdapter
 from typing_extensions import TypedDict
 
@@ -61,6 +60,8 @@ def write_run_head(run: Path, recipe: dict[str, Any], **about: Any) -> None:
 
 def this_machine() -> dict[str, str]:
     """Processor, memory, system and GPUs of this machine, for people; no name that would tell whose it is."""
+    import psutil  # a registered model, which reads the notes of others, comes without it
+
     facts = {
         "processor": f"{_processor()}, {_cores()} cores",
         "memory": f"{psutil.virtual_memory().total / 2**30:.0f} GiB",
