@@ -152,7 +152,7 @@ def closing_words(folder: SingleRunFolder, server: Server) -> str:
     dsffnet = f"{programs}dsffnet"
     ui = (
         f"make ui OUT={shlex.quote(str(shown).replace('$', '$$'))}"
-        if sqlite_file(server.uri) == out / "mlflow.db"
+        if sqlite_file(server.uri) == Path(os.path.realpath(out)) / "mlflow.db"
         else f"look at MLflow ({server.uri}), experiment {EXPERIMENT!r}"
     )
     return f"""

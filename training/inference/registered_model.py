@@ -20,7 +20,7 @@ import mlflow
 import numpy as np
 from mlflow.pyfunc import PythonModel
 
-from datagen.common.errors import MeshError, RecipeError, RegistryError
+from datagen.common.errors import DsffnetError, MeshError, RecipeError, RegistryError
 from datagen.mesh.files import read_mesh_file
 from datagen.mesh.geometry import Mesh, check_mesh
 from training.inference.orientation import Axes, axes_of_both, orientation
@@ -90,8 +90,10 @@ def _source(model_input: Any) -> Mesh:
     return check_mesh(Mesh(np.asarray(given, np.float64), np.zeros((1, 3), np.int64)), name="source")
 
 
-def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
+def download_weights(uri: str, tracking_uri: str, folder: Path, *, own: bool = False) -> Path:
     """Fetch the weights of a registered model (``models:/NAME@ALIAS`` or ``models:/NAME/VERSION``) into a folder.
+
+    ``own``: the store is one that a folder came with, which nobody has named.
 
     Raises
     ------
@@ -103,11 +105,12 @@ def download_weights(uri: str, tracking_uri: str, folder: Path) -> Path:
         raise RegistryError(f"{uri} cannot be had: there is no MLflow store {database}; check --tracking-uri")
     try:
         if database:
-            prepare_store(sqlite_server(database))
+            prepare_store(sqlite_server(database, own=own))
         with _server(tracking_uri):
             found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder)))
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        first = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        reason = str(error) if isinstance(error, DsffnetError) else first
         raise RegistryError(f"{uri} cannot be had from MLflow at {tracking_uri}: {reason}") from error
     weights = found / "artifacts" / "weights"
     if not weights.is_dir():

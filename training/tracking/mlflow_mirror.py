@@ -16,11 +16,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from datagen.common.errors import DsffnetError, TrackingError
+from datagen.common.errors import DsffnetError, TrackingError, UnsafeFileError
 from datagen.common.files import lock_within
 from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
-from training.tracking.mlflow_store import prepare_store
+from training.tracking.mlflow_store import prepare_store, require_inside
 from training.tracking.model_registry import Registration
 from training.tracking.record import EXPERIMENT, Record, Server, find_records, parent_of, read_record
 from training.tracking.threads import background
@@ -65,9 +65,10 @@ def publish(root: Path, server: Server) -> None:
     if failures:
         log.debug("publishing %s failed", root, exc_info=failures[0])
         reason = str(failures[0]) if isinstance(failures[0], DsffnetError) else _first_line(failures[0])
+        later = f". Nothing is lost: {_how_to_sync(root, server)} sends what is missing"
         raise TrackingError(
-            f"MLflow at {server.uri} could not be brought up to date ({reason}). Nothing is lost: "
-            f"{_how_to_sync(root, server)} sends what is missing"
+            f"MLflow at {server.uri} could not be brought up to date ({reason})"
+            f"{'' if isinstance(failures[0], UnsafeFileError) else later}"
         ) from failures[0]
 
 
@@ -76,7 +77,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _how_to_sync(root: Path, server: Server | None) -> str:
-    uri = f" --tracking-uri {shlex.quote(server.uri)}" if server else ""
+    uri = f" --tracking-uri {shlex.quote(server.uri)}" if server and not server.own else ""  # named, it is trusted
     return f"dsffnet sync {shlex.quote(str(root))}{uri}"
 
 
@@ -111,6 +112,7 @@ class _Publication:
             run = self._find_or_create_run()
             self.sent = {"run": run.info.run_id, "offsets": {}, "artifacts": {}}
             self._note()
+        require_inside(run.info.artifact_uri, self.server)
         self._send_parameters(run.data)
         if self.record.tags != self.sent.get("tags", {}):
             self._send_tags()
@@ -124,14 +126,15 @@ class _Publication:
             self._send_status()
 
     def _known_run(self) -> Any:
-        """The run that was noted, None where there is none or a person has deleted it."""
+        """The run that was noted, None where there is none, it is deleted, or it is none of our experiment's."""
         from mlflow.exceptions import MlflowException
 
         if "run" not in self.sent:
             return None
         try:
             run = self.client.get_run(self.sent["run"])
-            return run if run.info.lifecycle_stage == "active" else None
+            is_ours = run.info.experiment_id == _experiment(self.client, self.server)
+            return run if is_ours and run.info.lifecycle_stage == "active" else None
         except MlflowException as error:
             if error.error_code == "RESOURCE_DOES_NOT_EXIST":
                 return None

@@ -82,18 +82,19 @@ def prepare_store(server: Server) -> None:
     if server.artifacts:
         _correct_places(database, server.artifacts)
     if server.own and server.artifacts:
-        _refuse_places_elsewhere(database, server.artifacts)
+        _refuse_places_elsewhere(database, server)
 
 
-def require_inside(place: object, database: Path, artifacts: Path) -> None:
-    """Refuse a place of artifacts, as MLflow notes it, that is not in the folder ``artifacts``.
+def require_inside(place: object, server: Server) -> None:
+    """Refuse a place of artifacts, as MLflow notes it, that is not in the folder of a store that is the folder's own.
 
     Raises
     ------
     UnsafeFileError
         It is elsewhere: MLflow would read and write there.
     """
-    if not _is_inside(place, artifacts):
+    if server.own and server.artifacts and not _is_inside(place, server.artifacts):
+        database = Path(server.uri.removeprefix(_SCHEME))
         raise UnsafeFileError(
             f"{database} notes artifacts at {str(place)[:200]!r}, outside its folder. If the folder was moved without "
             f"its mlartifacts, move {database.name} away and run again: a new store gets all that the folder still "
@@ -219,13 +220,13 @@ def _refuse_code(database: Path) -> None:
                 )
 
 
-def _refuse_places_elsewhere(database: Path, artifacts: Path) -> None:
-    """Refuse a store that notes artifacts outside the folder ``artifacts``."""
+def _refuse_places_elsewhere(database: Path, server: Server) -> None:
+    """Refuse a store that notes artifacts outside its folder."""
     accepted = _accepted(database)
     with _opened(database) as connection:
         for (place,) in connection.execute(_USED_PLACES, {"name": EXPERIMENT}):
             if place not in accepted:
-                require_inside(place, database, artifacts)
+                require_inside(place, server)
                 accepted.add(place)
 
 

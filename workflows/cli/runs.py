@@ -174,6 +174,7 @@ def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
     """Keep MLflow up to date with a run folder while the block runs; an outage is an error only at the end."""
     from training.tracking.mlflow_mirror import Mirror
 
+    run = run.resolve()  # the store of a run lies beside it, not beside a link to it
     records = _recorded(run)
     uri = options.tracking_uri
     with Mirror(run, server_of_record(records[0], uri) if records else server_of(run.parent, uri)):

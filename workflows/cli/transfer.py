@@ -1,7 +1,6 @@
 """``dsffnet transfer``: pose a mesh, or a sequence of meshes, like another."""
 
 import argparse
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +9,9 @@ from pathlib import Path
 from datagen.common.errors import RecipeError
 from datagen.common.printable import printable
 from datagen.common.resources import memory_errors
+from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
-from workflows.pipeline.console import print_text
+from workflows.pipeline.console import print_text, server_of
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
@@ -94,18 +94,16 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path]:
     from training.inference.registered_model import download_weights
 
     with tempfile.TemporaryDirectory(prefix="dsffnet-") as folder:
-        yield download_weights(options.model, _tracking_uri(options.tracking_uri), Path(folder))
+        server = _server(options.tracking_uri)
+        yield download_weights(options.model, server.uri, Path(folder), own=server.own)
 
 
-def _tracking_uri(asked: str | None) -> str:
+def _server(asked: str | None) -> Server:
     """The server of registered models: as asked, as the environment says, or the quickstart's own store."""
-    from training.tracking.mlflow_store import sqlite_server
-
-    own = sqlite_server(_OWN_STORE.absolute()).uri if _OWN_STORE.is_file() else ""
-    uri = asked or os.environ.get("MLFLOW_TRACKING_URI") or own
-    if not uri:
+    server = server_of(_OWN_STORE.parent, asked)
+    if server.own and not _OWN_STORE.is_file():
         raise RecipeError("models:/ needs an MLflow server: add --tracking-uri URI, or set MLFLOW_TRACKING_URI")
-    return uri
+    return server
 
 
 def _rate(word: str) -> float:

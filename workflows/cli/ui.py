@@ -28,7 +28,7 @@ def ui_command(options: argparse.Namespace) -> None:
       dsffnet ui
       dsffnet ui runs/custom --port 5001
     """
-    database = Path(options.out).absolute() / "mlflow.db"
+    database = Path(os.path.realpath(options.out)) / "mlflow.db"
     if not database.is_file():
         raise DatasetError(
             f"{database} is not there yet: python workflows/full.py makes it; for another folder: dsffnet ui FOLDER"

@@ -106,11 +106,12 @@ def server_of(out: Path, uri: str | None) -> Server:
     database = sqlite_file(uri or "")
     if database:
         return sqlite_server(Path(require_reachable(str(database), option="--tracking-uri sqlite:///")))
-    return Server(uri) if uri else sqlite_server(out.absolute() / "mlflow.db", own=True)
+    return Server(uri) if uri else sqlite_server(Path(os.path.realpath(out)) / "mlflow.db", own=True)
 
 
 def server_of_record(root: Path, uri: str | None) -> Server:
     """The server for a record; a run that is no part of a workflow has its SQLite store beside it."""
+    root = root.resolve()  # what is beside a link is not beside the run
     record = read_record(root)
     is_workflow = record is not None and record.kind in ("workflow", "sweep", "comparison", "ablation")
     return server_of(root if is_workflow else root.parent, uri)

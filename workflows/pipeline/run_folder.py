@@ -3,6 +3,8 @@
 To add a file: one line here. The test of a finished workflow fails for a file that no line owns.
 """
 
+import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -78,9 +80,15 @@ class _Folder:
         Raises
         ------
         WorkflowError
-            Another process holds it.
+            Another process holds it, or it is a link to what is not there.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise WorkflowError(
+                f"{self.path} leads to {os.path.realpath(self.path)}, which is not there or no folder. Mount or make "
+                "it, or choose another --out"
+            ) from error
         try:
             with lock_within(self.path, self.lock.name).acquire(timeout=0):
                 yield
@@ -203,6 +211,11 @@ class WorkflowFolder(_Folder):
         if not self._is_ours():
             raise RecipeError(
                 f"{self.path} holds files, but no {self.kind} of ours, so --fresh leaves it alone. Choose another --out"
+            )
+        if self.dataset.is_symlink():
+            raise RecipeError(
+                f"{self.dataset} is a link, and --fresh removes nothing elsewhere. Remove the dataset itself: "
+                f"rm -r {shlex.quote(os.path.realpath(self.dataset))}; or the link"
             )
         remove(self.data)
         super().remove()

@@ -61,8 +61,7 @@ def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, paramet
     UnsafeFileError
         A link in the folder leads out of it: what is written there would go elsewhere.
     """
-    if parent:  # the outermost folder may hold links of its owner's, such as a dataset on another disk
-        refuse_links_out(folder)
+    refuse_links_out(folder, but=() if parent else ("dataset.zarr",))  # its owner's dataset may be on another disk
     begin_record(folder, name=name, kind=kind, parent=parent, parameters=flatten(parameters))
     try:
         yield

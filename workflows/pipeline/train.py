@@ -1,5 +1,6 @@
 """The stage that trains, and what every training of a command has in common."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -7,6 +8,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from datagen.common.errors import DsffnetError, TrainingError
+from datagen.common.files import refuse_links_out, resolve_within
 from datagen.common.json_files import read_json_if_whole
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
@@ -103,8 +105,13 @@ def refuse_conflicts(recipe: DatasetRecipe, folder: WorkflowFolder, runs: Mappin
     ------
     RecipeError, DatasetError, CheckpointError
         It is one; nothing in it was touched.
+    UnsafeFileError
+        A link leads out of it, where something would be written; the dataset may lie elsewhere.
     """
     folder.require_kind()
+    refuse_links_out(folder.path, but=(folder.dataset.name,))
+    for run in runs:
+        resolve_within(folder.path, os.path.relpath(run, folder.path))
     if not (folder.dataset / "zarr.json").exists():
         return
     group = open_group(folder.data)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from datagen.common.errors import RecipeError
+from datagen.common.errors import RecipeError, WorkflowError
 from tests.support.commands import command
 from training.tracking.record import begin_record
 from workflows.pipeline.run_folder import ComparisonFolder, RunFolder, SingleRunFolder, SweepFolder
@@ -50,6 +50,24 @@ def test_starting_over_keeps_what_is_not_ours_the_locks_and_the_store(out: Path)
     kept = {path.name for path in out.iterdir()}
     assert kept <= {"thesis.txt", "mlflow.db", "mlflow.db.lock", "mlartifacts", ".lock", "dataset.zarr.lock"}
     assert {"thesis.txt", "mlflow.db", "mlartifacts"} <= kept
+
+
+def test_a_dataset_that_is_a_link_is_not_removed_elsewhere(tmp_path: Path) -> None:
+    out, elsewhere = tmp_path / "out", tmp_path / "other disk" / "dataset.zarr"
+    for folder in (out, elsewhere / "pose"):
+        folder.mkdir(parents=True)
+    (out / "recipe.yaml").write_text("")
+    (out / "dataset.zarr").symlink_to(elsewhere)
+    with pytest.raises(RecipeError, match=rf"Remove the dataset itself: rm -r '{elsewhere}'; or the link"):
+        SingleRunFolder(out).remove()
+    assert (elsewhere / "pose").is_dir() and (out / "recipe.yaml").exists()
+
+
+def test_a_folder_that_leads_to_a_disk_that_is_not_there_says_so(tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "disk" / "out")
+    says = rf"out leads to {tmp_path}/disk/out, which is not there .*Mount or make it"
+    with pytest.raises(WorkflowError, match=says), SingleRunFolder(tmp_path / "out").alone():
+        pytest.fail("it began")
 
 
 def test_what_a_failed_run_leaves_is_removed_too(out: Path) -> None:

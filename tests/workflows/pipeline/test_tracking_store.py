@@ -1,12 +1,14 @@
 """MLflow's SQLite store: whole or not there at all, where it was asked for, and valid after its folder has moved."""
 
 import os
+import re
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -16,14 +18,16 @@ import mlflow.store.db.utils as mlflow_tables
 import pytest
 from mlflow.tracking._tracking_service.utils import _artifact_repos_cache
 
-from datagen.common.errors import RecipeError, StorageError, TrackingError, UnsafeFileError
+from datagen.common.errors import RecipeError, RegistryError, StorageError, TrackingError, UnsafeFileError
 from tests.support.files import tree_hash
-from training.tracking import mlflow_store
+from training.tracking import mlflow_mirror, mlflow_store
+from training.tracking.mirror_state import note_sent
 from training.tracking.mlflow_mirror import publish
 from training.tracking.mlflow_store import prepare_store, sqlite_server
 from training.tracking.record import EXPERIMENT, Server, begin_record, update_record
 from workflows import full
-from workflows.pipeline.console import guarded, server_of
+from workflows.cli import runs, transfer
+from workflows.pipeline.console import guarded, server_of, server_of_record
 from workflows.pipeline.run_folder import SingleRunFolder
 
 ROOT = Path(__file__).parents[3]
@@ -264,6 +268,19 @@ def test_a_place_that_is_no_path_is_said_in_one_short_line(tmp_path: Path, empty
         assert said.endswith(f"name the store: --tracking-uri {uri}; its pages: mlflow ui --backend-store-uri {uri}")
 
 
+def test_models_come_from_a_store_that_nobody_named_only_where_it_lies_whole_in_its_folder(
+    tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = recorded(tmp_path / "runs" / "quickstart", empty_store)
+    client = mlflow.MlflowClient(server(out).uri)
+    client.create_registered_model("dsffnet")
+    client.create_model_version("dsffnet", (tmp_path / "private").as_uri())
+    monkeypatch.chdir(tmp_path)
+    asked = Namespace(model="models:/dsffnet/1", tracking_uri=None)
+    with pytest.raises(RegistryError, match=r"notes artifacts at .*private', outside its folder.*name the store"):
+        transfer.weights_of(asked).__enter__()
+
+
 def test_runs_of_others_in_the_store_of_a_folder_lie_in_it_too(tmp_path: Path, empty_store: Path) -> None:
     """MLflow's pages show them; what a person logs to the server of those pages is kept beside the store."""
     out = recorded(tmp_path / "out", empty_store)
@@ -296,6 +313,68 @@ def test_a_store_that_is_locked_or_whose_lock_is_a_link_is_one_line(tmp_path: Pa
     with pytest.raises(UnsafeFileError, match=r"'mlflow\.db\.lock', a link"):
         prepare_store(server(out))
     assert not (tmp_path / "victim").exists()
+
+
+def test_a_run_that_was_put_elsewhere_meanwhile_is_not_written_to(
+    tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Places are looked at before anything is sent, and that of the run once it is known."""
+    out = recorded(tmp_path / "out", empty_store)
+    publish(out, server(out))
+    (out / "figures" / "curve.png").write_bytes(b"another")
+    execute(out / "mlflow.db", f"UPDATE runs SET artifact_uri = '{(tmp_path / 'victim').as_uri()}'")
+    monkeypatch.setattr(mlflow_mirror, "prepare_store", lambda _: None)
+    with pytest.raises(TrackingError, match="outside its folder") as raised:
+        publish(out, server(out))
+    assert not (tmp_path / "victim").exists()
+    assert "dsffnet sync" not in str(raised.value), "a store that is named is not guarded"
+
+
+def test_a_run_that_is_noted_but_of_another_experiment_is_not_ours(tmp_path: Path, empty_store: Path) -> None:
+    out = recorded(tmp_path / "out", empty_store)
+    client = mlflow.MlflowClient(server(out).uri)
+    theirs = client.create_run(client.create_experiment("theirs", (out / "mlartifacts" / "9").as_uri())).info.run_id
+    note_sent(out, server(out).uri, {"run": theirs, "offsets": {}, "artifacts": {}})
+    publish(out, server(out))
+    assert the_run(out).data.params == {"training.batch": "8"} and not client.get_run(theirs).data.params
+
+
+def test_how_to_send_later_names_only_a_store_that_was_named(
+    tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = recorded(tmp_path / "out", empty_store)
+
+    def broken(_: object) -> None:
+        raise StorageError("no")
+
+    monkeypatch.setattr(mlflow_mirror, "prepare_store", broken)
+    for uri, says in ((None, f"dsffnet sync {out} sends"), (server(out).uri, f" --tracking-uri {server(out).uri} s")):
+        with pytest.raises(TrackingError, match=re.escape(says)):
+            publish(out, server_of(out, uri))
+
+
+def test_a_link_to_a_folder_has_the_store_of_the_folder(
+    tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the command; of a single run the store beside it, not beside the link."""
+    out, link = recorded(tmp_path / "out", empty_store), tmp_path / "links" / "out"
+    link.parent.mkdir()
+    link.symlink_to(out)
+    run = out / "run"
+    begin_record(run, name="train", kind="train", parent=None, parameters={})
+    (tmp_path / "links" / "run").symlink_to(run)
+    (out / "run" / "evaluation").mkdir()
+    (out / "run" / "evaluation" / "tables.md").write_text("")
+    assert server_of(link, None) == server_of_record(link, None) == server(out)
+    assert server_of_record(tmp_path / "links" / "run", None) == server(out)
+    assert "make ui OUT=" in full.closing_words(SingleRunFolder(link), server_of(link, None))
+    servers: list[Server] = []
+    monkeypatch.setattr(mlflow_mirror, "publish", lambda root, server: servers.append(server))
+    for _ in ("a record", "none yet"):
+        with runs._mirrored(tmp_path / "links" / "run", Namespace(tracking_uri=None)):
+            pass
+        (run / "record.json").unlink(missing_ok=True)
+    assert len(servers) >= 2 and set(servers) == {server(out)}
 
 
 @pytest.mark.parametrize("name", ["mlflow.db", "mlartifacts", "mlartifacts/1/x/artifacts/figures/curve.png"])

@@ -11,7 +11,7 @@ import pytest
 
 from datagen.common.errors import UnsafeFileError
 from datagen.store import open_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import tiny_dataset, tiny_training
 from tests.support.workflows import finished_workflow
 from training.recipes.training import EvaluationRecipe
 from training.reports.report import NAMES
@@ -20,9 +20,10 @@ from workflows import full
 from workflows.cli.main import main
 from workflows.pipeline import generate, train
 from workflows.pipeline.evaluate import is_evaluated
-from workflows.pipeline.run_folder import RunFolder
+from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import refuse_conflicts
 from workflows.recipe.loader import WorkflowRecipe
 
 FOLDERS = {"workflow": ".", "generate": "generate", "train": "run", "evaluate": "run/evaluation"}
@@ -139,7 +140,10 @@ def test_a_run_has_the_permissions_of_the_umask(tmp_path: Path, dataset: str) ->
 
 
 @pytest.mark.parametrize("name", ["figures", "tables.md", "record.json", "measured"])
-def test_links_that_lead_out_of_a_stage_are_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("inside", [True, False], ids=["of a workflow", "alone"])
+def test_links_that_lead_out_of_a_stage_are_refused_before_anything_is_written(
+    tmp_path: Path, name: str, inside: bool
+) -> None:
     victim = tmp_path / "victim"
     victim.mkdir()
     (victim / "record.json").write_text("{}")
@@ -147,8 +151,30 @@ def test_links_that_lead_out_of_a_stage_are_refused_before_anything_is_written(t
     (tmp_path / "run" / "evaluation" / name).symlink_to(victim if "." not in name else victim / "record.json")
     with (
         pytest.raises(UnsafeFileError, match="link"),
-        recorded(tmp_path / "run" / "evaluation", kind="evaluate", name="x", parent=tmp_path / "run", parameters={}),
+        recorded(
+            tmp_path / "run" / "evaluation",
+            kind="evaluate",
+            name="x",
+            parent=tmp_path / "run" if inside else None,
+            parameters={},
+        ),
     ):
         pytest.fail("it began")
     assert [path.name for path in victim.iterdir()] == ["record.json"]
     assert (victim / "record.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("name", ["run", "generate", "stages", "trials", "trials/a"])
+def test_links_that_lead_out_of_a_workflow_are_refused_before_anything_is_done(tmp_path: Path, name: str) -> None:
+    """Not when all has been trained; the dataset may lie elsewhere, and so may the whole folder."""
+    out, victim, recipe = tmp_path / "out", tmp_path / "victim", tiny_dataset()
+    victim.mkdir()
+    (out / name).parent.mkdir(parents=True)
+    (out / "dataset.zarr").symlink_to(victim)
+    (tmp_path / "link").symlink_to(out)
+    folder, runs = SingleRunFolder(tmp_path / "link"), {tmp_path / "link" / "trials" / "a": tiny_training()}
+    refuse_conflicts(recipe, folder, runs)
+    (out / name).symlink_to(victim)
+    with pytest.raises(UnsafeFileError, match=rf"a link that leads out .*link the whole folder {out}.* instead"):
+        refuse_conflicts(recipe, folder, runs)
+    assert not list(victim.iterdir())
