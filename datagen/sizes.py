@@ -19,9 +19,9 @@ _VERTEX = 12
 """Bytes of a vertex: three float32."""
 _LOOKED_AT = 24
 """Identities whose vertices are counted; characters and mixed bodies differ between identities."""
-_DISK_SHARE, _DISK_MESH, _DISK_IDENTITY, _DISK_POSE = 0.85, 120, 25_000, 600
+_DISK_SHARE, _DISK_MESH, _DISK_IDENTITY, _DISK_POSE = 0.85, 120, 100, 600
 """After compression; and bytes beside the vertices. Anny's bodies compress to 0.80, legs to 0.76."""
-_SECONDS_MESH, _SECONDS_VERTEX, _SECONDS_IDENTITY, _SECONDS_POSE = 110e-6, 33e-9, 0.04, 0.4e-3
+_SECONDS_MESH, _SECONDS_VERTEX, _SECONDS_IDENTITY, _SECONDS_POSE = 110e-6, 33e-9, 1e-3, 0.4e-3
 _MEMORY_IDENTITY, _MEMORY_POSE, _MEMORY_SHARD, _MEMORY_TRIPLE = 20_000, 2_000, 1_000, 120
 _MEMORY_VERTEX, _MEMORY_MESHES = 460, 3
 """Bytes of a body a vertex, and how often a task holds the vertices of its shard."""

@@ -97,7 +97,7 @@ def test_what_the_format_cannot_hold_is_refused_before_poses_are_drawn(tmp_path:
 def test_the_line_that_a_person_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = DatasetRecipe(body=AnnyBody(topology="anny"))
     assert str(size_of(recipe, workers=2)) == (
-        "12,800 meshes of 13,718 vertices, 2.1 GB (on disk about 1.8 GB), about 5 s of work"
+        "12,800 meshes of 13,718 vertices, 2.1 GB (on disk about 1.8 GB), about 4 s of work"
     )
     monkeypatch.setattr(sizes, "load_body", lambda body: pytest.fail("it is known without loading"))
     assert size_of(tiny_dataset()).vertices == 32
