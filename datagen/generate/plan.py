@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.common.seeding import Stream, generator
+from datagen.generate.rigs import RigTable
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
@@ -45,8 +46,10 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
     parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
     topologies = _Topologies(recipe, body)
     numbers = [topologies.number_of(identity, its) for identity, its in enumerate(parameters)]
+    table = RigTable()
+    rig_numbers = [table.add(body.rig(its, source.joints)) for its in parameters]
     return Plan(
-        attributes=_attributes(recipe, body, source),
+        attributes={**_attributes(recipe, body, source), "rigs": table.parts},
         provenance={
             "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
             "git_commit": _git_commit(),
@@ -56,6 +59,8 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
         faces=topologies.faces,
         poses=poses,
         triples=evaluation_lists(grid),
+        rigs=table.rigs,
+        rig_numbers=np.array(rig_numbers, np.int32),
     )
 
 

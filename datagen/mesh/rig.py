@@ -57,6 +57,35 @@ class Rig:
         return part_transforms(self.rotations(world), self.joints.astype(np.float64), self.parents)
 
 
+@dataclass(frozen=True, eq=False)
+class Rigs:
+    """The rigs of several identities whose bodies have the same parts.
+
+    Parameters
+    ----------
+    names, parents, drivers, corrections
+        As in :class:`Rig`.
+    weights
+        Skinning weights [kind, vertex, part] float32 of the different kinds; of most families there is one.
+    kinds
+        Kind [identity] int32 of each identity's weights.
+    joints
+        Places [identity, part, 3] float32 at rest.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    drivers: tuple[int, ...]
+    corrections: NDArray[np.float64]
+    weights: NDArray[np.float32]
+    kinds: NDArray[np.int32]
+    joints: NDArray[np.float32]
+
+    def __getitem__(self, row: int) -> Rig:
+        weights = self.weights[self.kinds[row]]
+        return Rig(self.names, self.parents, self.drivers, self.corrections, weights, self.joints[row])
+
+
 def world_rotations(rotations: NDArray[np.float64], parents: Sequence[int]) -> NDArray[np.float64]:
     """Rotations [pose, joint, 3, 3] of a tree's joints relative to rest, in world axes.
 

@@ -38,6 +38,12 @@ class _Statistics(TypedDict):
     maximum: _Triple
 
 
+class _Parts(TypedDict):
+    names: list[str]
+    parents: list[int]
+    drivers: list[int]
+
+
 class _Attributes(TypedDict):
     uuid: str
     status: str
@@ -49,6 +55,7 @@ class _Attributes(TypedDict):
     joints: list[str]
     joint_parents: list[int]
     splits: dict[str, Any]
+    rigs: list[_Parts]
 
 
 class _Complete(_Attributes):
@@ -69,7 +76,19 @@ def attributes_fault(group: zarr.Group) -> str | None:
         return f"its attribute {'.'.join(map(str, first['loc']))[:80]} is wrong: {first['msg']}"
     if not _is_tree(attributes["joints"], attributes["joint_parents"]):
         return "its attributes joints and joint_parents are no tree"
+    if not all(_are_parts(parts, joints=len(attributes["joints"])) for parts in attributes["rigs"]):
+        return "its attribute rigs names no parts of a body"
     return None
+
+
+def _are_parts(parts: _Parts, *, joints: int) -> bool:
+    """Whether the parts of a rig have parents before them and pose joints that are there."""
+    names, parents, drivers = parts["names"], parts["parents"], parts["drivers"]
+    return (
+        0 < len(names) == len(parents) == len(drivers)
+        and all(-1 <= parent < part for part, parent in enumerate(parents))
+        and all(-1 <= driver < joints for driver in drivers)
+    )
 
 
 def _is_tree(joints: list[str], parents: list[Any]) -> bool:

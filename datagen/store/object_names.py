@@ -9,7 +9,7 @@ from datagen.store.codec import LARGEST_CHUNK
 
 _NUMBER = "[0-9]{1,9}"
 _MEMBER = re.compile(
-    rf"""(?:(?:grid|grid/training|grid/evaluation|topology|pose|evaluation|manifest)/)?zarr\.json
+    rf"""(?:(?:grid|grid/training|grid/evaluation|topology|pose|evaluation|rig|manifest)/)?zarr\.json
     |grid/topology/(?:zarr\.json|c/0)
     |grid/(?:training|evaluation)/{_NUMBER}/(?:zarr\.json|(?:vertices|identity|pose|parameters)/zarr\.json
         |(?:identity|pose)/c/0|parameters/c/0/0|vertices/c/{_NUMBER}/{_NUMBER}/0/0)
@@ -17,13 +17,16 @@ _MEMBER = re.compile(
     |topology/{_NUMBER}/(?:zarr\.json|faces/zarr\.json|faces/c/0/0)
     |pose/parameters/(?:zarr\.json|c/0/0/0)
     |evaluation/(?:seen|unseen)/(?:zarr\.json|c/0/0)
+    |rig/number/(?:zarr\.json|c/0)
+    |rig/{_NUMBER}/(?:zarr\.json|(?:weights|kind|joints|corrections)/zarr\.json|kind/c/0
+        |(?:weights|joints|corrections)/c/0/0/0)
     |manifest/(?:rows|bytes)/(?:zarr\.json|c/0)
     |manifest/(?:place|sha256|object_sha256)/(?:zarr\.json|c/0/0)
     |manifest/extent/(?:zarr\.json|c/0/0/0)""",
     re.VERBOSE,
 )
-MEMBERS = ("grid", "topology", "pose", "evaluation", "manifest")
-"""The groups that a dataset's root holds."""
+MEMBERS = ("grid", "topology", "pose", "evaluation", "rig", "manifest")
+"""The groups that a dataset's root holds; ``rig`` only where bodies have one."""
 _LEFTOVER = re.compile(r"(?:[a-z0-9]+/)*[a-z0-9]+\.[0-9a-f]+\.partial")
 """What a killed writer leaves of an object."""
 LONGEST_LIST = 2**27

@@ -14,13 +14,23 @@ from zarr.abc.store import ByteRequest, RangeByteRequest, SuffixByteRequest
 
 from datagen.common.errors import DatasetError, ShardDamage, UnsafeFileError, reason_of
 from datagen.grid import Grid, GridArray, GridArrays, PoseType, Split, shard_path
+from datagen.mesh.rig import Rig, Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, check_vertices, read_array
 from datagen.store.attributes import attributes_fault
 from datagen.store.codec import ShardCodec
 from datagen.store.manifest import Manifest, ManifestRow, covers, is_sealed, read_manifest
 from datagen.store.objects import read_bytes, stored_sizes
-from datagen.store.schema import attributes_of, check_version, codec_of, open_group, stored_arrays, stored_recipe
+from datagen.store.schema import (
+    attributes_of,
+    check_version,
+    codec_of,
+    open_group,
+    stored_arrays,
+    stored_recipe,
+    stored_rig_numbers,
+    stored_rigs,
+)
 
 Meshes = NDArray[np.float32]
 _TOGETHER_FROM = 4  # the part of a shard that holds some meshes is read at once where a quarter of it is wanted
@@ -109,6 +119,34 @@ class Dataset:
                 self._parameters[array.path] = read_array(self.group, f"{array.path}/parameters", "float64", shape)
         return self._parameters[array.path][row]
 
+    def rig(self, identity: int) -> Rig | None:
+        """The rig of an identity; None where its body has no skeleton. Read when first asked for, then kept.
+
+        Examples
+        --------
+        >>> world = world_rotations(dataset.rotations(), dataset.attributes["joint_parents"])
+        >>> transforms = dataset.rig(0).transforms(world)  # [pose, part, 3, 4], from rest to each pose
+        """
+        number = int(self._rig_numbers[identity])
+        if number < 0:
+            return None
+        if number not in self._rigs:
+            parts, count = self.attributes["rigs"][number], int((self._rig_numbers == number).sum())
+            vertices = self.arrays.vertices[self.arrays.topologies[identity]]
+            with self._damage():
+                self._rigs[number] = stored_rigs(self.group, number, parts, identities=count, vertices=vertices)
+        return self._rigs[number][int((self._rig_numbers[:identity] == number).sum())]
+
+    def check_rigs(self) -> None:
+        """Read every rig (DatasetError where one is not as the format has it)."""
+        for identity in np.unique(self._rig_numbers, return_index=True)[1].tolist():
+            self.rig(identity)
+
+    @cached_property
+    def _rig_numbers(self) -> NDArray[np.int32]:
+        with self._damage():
+            return stored_rig_numbers(self.group, self.arrays, len(self.attributes["rigs"]))
+
     def rotations(self) -> NDArray[np.float64]:
         """Rotations [pose, joint, 3] of the whole dataset's poses, axis-angle in radians, over its named joints."""
         joints = self.attributes["joints"]
@@ -146,6 +184,10 @@ class Dataset:
 
     @cached_property
     def _parameters(self) -> dict[str, NDArray[np.float64]]:
+        return {}
+
+    @cached_property
+    def _rigs(self) -> dict[int, Rigs]:
         return {}
 
     @cached_property

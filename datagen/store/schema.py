@@ -8,18 +8,26 @@ NAME.zarr                        status building|complete, recipe, splits, prove
   topology/vertex_count          (topology,) int32, vertices of a mesh of each topology
   topology/T/faces               (face, 3) int32
   pose/parameters                (pose, joint, 3) float64, axis-angle in radians
+  rig/number                     (identity,) int32, the rig of each identity, -1: none; no group where there is no rig
+  rig/R/weights                  (kind, vertex, part) float32, skinning weights
+  rig/R/kind, joints             (identity of R,) int32, the weights of each; (identity of R, part, 3) float32, at rest
+  rig/R/corrections              (part, 3, 3) float64, from the body's rest to that of the poses
   evaluation/seen, /unseen       (triple, 4) int32: source identity, source pose, target identity, target pose
   manifest/place, rows, bytes, sha256, extent, object_sha256; committed last
 """
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
+import numpy as np
 import zarr
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from zarr.errors import ContainsGroupError
 
 from datagen.common.errors import DatasetError, DsffnetError, NoDataset, reason_of
 from datagen.grid import Grid, GridArray, GridArrays, Shard
+from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.codec import LARGEST_CHUNK, ShardCodec
@@ -58,6 +66,56 @@ def stored_arrays(group: zarr.Group, grid: Grid) -> GridArrays:
     if arrays.shard_count > _MOST_SHARDS:
         raise ArrayDamage("topology/vertex_count/c/0", f"{arrays.shard_count:,} shards")
     return arrays
+
+
+def stored_rig_numbers(group: zarr.Group, arrays: GridArrays, count: int) -> NDArray[np.int32]:
+    """Number [identity] of each identity's rig among ``count``; -1 where it has none.
+
+    Raises
+    ------
+    ArrayDamage
+        They are missing or damaged, or identities of one rig differ in their vertices.
+    """
+    identities = arrays.grid.identity_count
+    if not count:
+        return np.full(identities, -1, np.int32)
+    numbers = read_array(group, "rig/number", "int32", (identities,))
+    if not ((numbers >= -1) & (numbers < count)).all():
+        raise ArrayDamage("rig/number/c/0", "a rig that is not there")
+    vertices = np.array(arrays.vertices, np.int64)[arrays.topologies]
+    for number in range(count):
+        if len(np.unique(vertices[numbers == number])) != 1:
+            raise ArrayDamage("rig/number/c/0", f"not the identities of rig {number}")
+    return numbers
+
+
+def stored_rigs(group: zarr.Group, number: int, parts: Mapping[str, Any], *, identities: int, vertices: int) -> Rigs:
+    """The rigs of a number, of so many identities and vertices.
+
+    Parameters
+    ----------
+    parts
+        Their entry in the root's attribute ``rigs``: names, parents and drivers of the parts.
+
+    Raises
+    ------
+    ArrayDamage
+        They are missing or damaged.
+    """
+    home, count = f"rig/{number}", len(parts["names"])
+    weights = read_array(group, f"{home}/weights", "float32", (None, vertices, count))
+    kinds = read_array(group, f"{home}/kind", "int32", (identities,))
+    if not ((kinds >= 0) & (kinds < len(weights))).all():
+        raise ArrayDamage(f"{home}/kind/c/0", "a kind of weights that is not there")
+    return Rigs(
+        names=tuple(parts["names"]),
+        parents=tuple(parts["parents"]),
+        drivers=tuple(parts["drivers"]),
+        corrections=read_array(group, f"{home}/corrections", "float64", (count, 3, 3)),
+        weights=weights,
+        kinds=kinds,
+        joints=read_array(group, f"{home}/joints", "float32", (identities, count, 3)),
+    )
 
 
 def attributes_of(group: zarr.Group) -> dict[str, Any]:

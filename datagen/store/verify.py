@@ -1,7 +1,7 @@
 """Finding every fault of a dataset, and describing one at any status."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -102,7 +102,7 @@ def _root_faults(dataset: Dataset) -> Iterator[Fault]:
 
 def _misfits(dataset: Dataset) -> Iterator[Fault]:
     """Arrays that are as they were committed, and yet not as the format has them."""
-    reads: list[Callable[[], Any]] = [lambda: dataset.arrays, dataset.rotations]
+    reads: list[Callable[[], Any]] = [lambda: dataset.arrays, dataset.rotations, dataset.check_rigs]
     reads += [partial(dataset.evaluation_triples, pose_type) for pose_type in POSE_TYPES]
     arrays = _arrays(dataset)
     for array in arrays.arrays if arrays else ():
@@ -132,6 +132,7 @@ def describe(url: str) -> dict[str, Any]:
         "identities": ", ".join(f"{_count(grid.identities(split))} {split}" for split in SPLITS),
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
         f"({recipe.poses.distribution.name}, {len(attributes['joints'])} joints)",
+        "rig": _rigs(attributes["rigs"]),
         "appended": _growth(recipe),
         "meshes": f"{grid.mesh_count:,} of {_vertex_counts(arrays)} vertices",
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
@@ -169,6 +170,23 @@ def _count(numbers: list[int]) -> str:
     spans = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = (f"{span[0]}-{span[-1]}" if len(span) > 1 else str(span[0]) for span in spans)
     return f"{len(numbers)} ({', '.join(words)})"
+
+
+def _rigs(rigs: Sequence[Mapping[str, Any]]) -> str:
+    """The parts of the first rig as a tree, and how many more rigs there are."""
+    if not rigs:
+        return ""
+    parts = rigs[0]
+    tree = ", ".join(_tree(parts["names"], parts["parents"], -1))
+    counts = ", ".join(str(len(its["names"])) for its in rigs[1:])
+    more = f"; other rigs of {counts} parts" if counts else ""
+    return f"{len(parts['names'])} parts: {tree}{more}"
+
+
+def _tree(names: Sequence[str], parents: Sequence[int], above: int) -> list[str]:
+    """The parts that hang on part ``above``, each with those that hang on it in brackets."""
+    below = [(name, _tree(names, parents, part)) for part, name in enumerate(names) if parents[part] == above]
+    return [f"{name} ({', '.join(inner)})" if inner else name for name, inner in below]
 
 
 def _growth(recipe: DatasetRecipe) -> str:

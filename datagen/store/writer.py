@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError, NoDataset, ShardDamage, UnsafeFileError, storage_errors
 from datagen.grid import HOLE, GridArray, GridArrays, PoseType, Shard
+from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import put_array, put_group, put_vertices_metadata
 from datagen.store.attributes import check_same_assets, check_same_recipe, with_history
@@ -55,6 +56,10 @@ class Plan:
         Axis-angle rotations in radians, float64 [pose, joint, 3].
     triples
         Evaluation triples int32 [triple, 4] of each pose type.
+    rigs
+        The rigs of identities whose bodies have the same parts, in the order of the attribute ``rigs``.
+    rig_numbers
+        Which of them each identity belongs to, int32 [identity]; -1 where its body has no skeleton.
     """
 
     attributes: Mapping[str, Any]
@@ -64,6 +69,8 @@ class Plan:
     faces: Sequence[NDArray[np.int32]]
     poses: NDArray[np.float64]
     triples: Mapping[PoseType, NDArray[np.int32]]
+    rigs: Sequence[Rigs]
+    rig_numbers: NDArray[np.int32]
 
     @property
     def recipe(self) -> DatasetRecipe:
@@ -81,6 +88,13 @@ class Plan:
             yield f"evaluation/{pose_type}", triples, ("triple", "column")
         for array in self.arrays.arrays:
             yield from self._axes(array)
+        if self.rigs:
+            yield "rig/number", self.rig_numbers, ("identity",)
+        for number, rigs in enumerate(self.rigs):
+            yield f"rig/{number}/weights", rigs.weights, ("kind", "vertex", "part")
+            yield f"rig/{number}/kind", rigs.kinds, ("identity",)
+            yield f"rig/{number}/joints", rigs.joints, ("identity", "part", "axis")
+            yield f"rig/{number}/corrections", rigs.corrections, ("part", "row", "column")
 
     def _axes(self, array: GridArray) -> Iterator[SmallArray]:
         parameters = np.where((array.identities == HOLE)[:, None], np.nan, self.parameters[array.identities])
@@ -139,7 +153,7 @@ def _put_arrays(group: zarr.Group, plan: Plan) -> None:
     groups = {path.rpartition("/")[0] for path, _, _ in plan.small_arrays()}
     splits = {f"grid/{array.split}" for array in plan.arrays.arrays}
     topologies = {f"topology/{number}" for number in range(len(plan.faces))}
-    for path in sorted({*MEMBERS, *groups, *splits, *topologies} - {"manifest"}):
+    for path in sorted({*MEMBERS, *groups, *splits, *topologies} - {"manifest", *({"rig"} - groups)}):
         put_group(group, path)
     for path, values, dimensions in plan.small_arrays():
         put_array(group, path, values, dimensions)

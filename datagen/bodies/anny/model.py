@@ -80,7 +80,9 @@ class AnnyModel:
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """The bones that carry a pose joint; twist bones, metacarpals and the like are folded into these."""
         drivers = drivers_of(self._bones.joints, self._bones.parents, joints)
-        return rig_of(self.rest(parameters), self._bones.labels, drivers, self._corrections)
+        heads = _y_up(self._shape.heads(tuple(parameters.tolist())))[self._bones.order]
+        rest = Rest(np.empty((0, 3)), heads, self._weights, self._bones.parents)
+        return rig_of(rest, self._bones.labels, drivers, self._corrections)
 
     def t_pose(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Vertices [vertex, 3] and bone heads [bone, 3] in SMPL's T-pose, which is no pose of the rig's own."""

@@ -190,6 +190,13 @@ class TestLocalChanges:
         assert np.array_equal(columns["local.l-ear-lobe-incr"], columns["local.r-ear-lobe-incr"])
         assert not np.array_equal(columns["local.l-ear-lobe-incr"], columns["local.l-ear-flap-incr"])
 
+    def test_a_rig_has_the_joints_of_the_whole_body_to_the_bit(self) -> None:
+        """Bone heads are added up without the vertices there."""
+        model = body(local_changes=0.4)
+        rig, rest = model.rig(identity(model, 3), JOINTS), model.rest(identity(model, 3))
+        bones = [model._bones.labels.index(name) for name in rig.names]
+        assert np.array_equal(rig.joints, rest.joints[bones].astype(np.float32))
+
     def test_zero_values_change_nothing_and_others_do(self) -> None:
         plain, changed = body(), body(local_changes=0.4)
         parameters = identity(changed, 3)

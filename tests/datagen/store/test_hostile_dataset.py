@@ -218,6 +218,10 @@ MENDED = [
     # names
     pytest.param(numbers("grid/topology", 7), id="a topology that is not there"),
     pytest.param(numbers("grid/topology", -1), id="topology -1"),
+    pytest.param(numbers("rig/number", 7), id="a rig that is not there"),
+    pytest.param(numbers("rig/0/kind", -1), id="kind of weights -1"),
+    pytest.param(attributes(rigs=[{"names": ["a"], "parents": [0], "drivers": [0]}]), id="a part that hangs on itself"),
+    pytest.param(attributes(rigs=[{"names": ["a"], "parents": [-1], "drivers": [24]}]), id="a driver of no joint"),
     # links, devices, pipes
     pytest.param(link(SHARD, "victim/thesis.txt"), id="shard: link out"),
     pytest.param(link(SHARD, "/dev/zero"), id="shard: /dev/zero"),
@@ -238,6 +242,8 @@ MENDED = [
     pytest.param(numbers("topology/vertex_count", 0), id="no vertices"),
     pytest.param(numbers("topology/vertex_count", 2**31 - 1), id="vertex count: 2^31"),
     pytest.param(shaped("grid/topology/zarr.json", 10**12), id="topologies: 10^12"),
+    pytest.param(shaped("rig/0/weights/zarr.json", 10**9, 32, 2), id="weights: 10^9 kinds"),
+    pytest.param(shaped("rig/0/joints/zarr.json", 5, 3, 3), id="joints of three parts"),
     pytest.param(shaped("manifest/sha256/zarr.json", 10**12, 32), id="manifest: 10^12 rows"),
     pytest.param(bomb, id="faces: a bomb"),
     pytest.param(other_faces, id="faces out of range"),
@@ -322,6 +328,7 @@ def read_all(url: str) -> None:
         opened.vertices(identity)
         opened.faces(identity)
         opened.parameters(identity)
+        opened.rig(identity)
     opened.rotations()
     opened.evaluation_triples("seen")
     opened.evaluation_triples("unseen")
