@@ -39,7 +39,7 @@ def _start() -> None:
                 _init()
             return
         except BaseException as error:
-            _end_processes()
+            _leave()
             if not isinstance(error, Exception):  # interrupted, or told to stop
                 raise
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -108,6 +108,15 @@ def _patience(seconds: float) -> Iterator[None]:
         yield
     finally:
         services.get_node = ask
+
+
+def _leave() -> None:
+    """Disconnect, then end the servers: Ray's client library aborts a process that is connected when they go."""
+    import ray
+
+    with suppress(Exception):
+        ray.shutdown()
+    _end_processes()
 
 
 def _end_processes() -> None:

@@ -166,7 +166,7 @@ def test_memory_that_runs_out_anywhere_is_one_line(
     def make_shard(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("datagen.generate.make_shard", make_shard)
+    monkeypatch.setattr("datagen.generate.shards.make_shard", make_shard)
     with pytest.raises(SystemExit) as ended:
         generate(tmp_path / "x.zarr")
     last = capsys.readouterr().err.splitlines()[-1]
