@@ -26,7 +26,7 @@ POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 SPLITS: tuple[Split, ...] = ("training", "evaluation")
 HOLE = -1
 """The number at a place along the identities or poses of an array that holds no mesh."""
-LARGEST_SHARD = 2**26
+MOST_MESHES, LARGEST_SHARD = 4096, 2**26
 """Bytes of the vertices of a shard, unless a single mesh has more."""
 Place = tuple[int, int, int, int]
 """Of a shard: number of its split, topology, place along the identities and along the poses, counted in shards."""
@@ -153,10 +153,11 @@ class Grid:
     def shard_shape(self, split: Split, *, identities: int, vertices: float) -> tuple[int, int]:
         """Identities and poses of a full shard of an array that begins with so many ``identities``.
 
-        No more meshes than the recipe says, than ``LARGEST_SHARD`` holds, and than there were at first; several
-        identities only where all first poses of one do not fill a shard.
+        No more meshes than the recipe says, than ``MOST_MESHES``, than ``LARGEST_SHARD`` holds, and than there were at
+        first; several identities only where all first poses of one do not fill a shard.
         """
-        most = max(1, min(self.recipe.store.poses_per_shard, int(LARGEST_SHARD // max(1, 12 * vertices))))
+        wanted = min(self.recipe.store.poses_per_shard, MOST_MESHES)
+        most = max(1, min(wanted, int(LARGEST_SHARD // max(1, 12 * vertices))))
         poses = min(most, self._added(split)[0])
         return max(1, min(most // poses, identities)), poses
 

@@ -13,7 +13,7 @@ import zarr
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
-from datagen.common.errors import ShardDamage, UnsafeFileError, reason_of
+from datagen.common.errors import DatasetError, ShardDamage, UnsafeFileError, reason_of
 from datagen.grid import GridArray
 from datagen.store.codec import LARGEST_CHUNK, ShardCodec, require_plausible
 from datagen.store.objects import put_bytes, read_bytes
@@ -34,7 +34,18 @@ class ArrayDamage(ValueError):
 
 
 def put_array(group: zarr.Group, path: str, values: NDArray[Any], dimensions: Sequence[str]) -> None:
-    """Store a small array in one chunk: little-endian, zstd with its checksum. What is there already is left alone."""
+    """Store a small array in one chunk: little-endian, zstd with its checksum. What is there already is left alone.
+
+    Raises
+    ------
+    DatasetError
+        It has more bytes than :func:`read_array` takes.
+    """
+    if values.nbytes > LARGEST_CHUNK:
+        raise DatasetError(
+            f"{path} would have {values.nbytes:,} bytes, one array holds {LARGEST_CHUNK:,}. Make several datasets of "
+            "fewer identities or poses"
+        )
     put_json(group, f"{path}/zarr.json", _small_metadata(values.dtype, values.shape, dimensions))
     if values.size:
         put_bytes(

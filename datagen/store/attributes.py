@@ -62,6 +62,7 @@ class _Complete(_Attributes):
     statistics: _Statistics
 
 
+_MOST_PARTS = 300  # of a rig; Anny has 52 bones
 _BUILDING, _COMPLETE = TypeAdapter(_Attributes), TypeAdapter(_Complete)
 
 
@@ -85,7 +86,7 @@ def _are_parts(parts: _Parts, *, joints: int) -> bool:
     """Whether the parts of a rig have parents before them and pose joints that are there."""
     names, parents, drivers = parts["names"], parts["parents"], parts["drivers"]
     return (
-        0 < len(names) == len(parents) == len(drivers)
+        0 < len(names) == len(parents) == len(drivers) <= _MOST_PARTS
         and all(-1 <= parent < part for part, parent in enumerate(parents))
         and all(-1 <= driver < joints for driver in drivers)
     )

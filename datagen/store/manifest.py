@@ -21,7 +21,7 @@ from datagen.mesh.geometry import bounds
 from datagen.store.arrays import put_array, put_group, read_array, read_json
 from datagen.store.object_names import is_member, require_member
 from datagen.store.objects import list_objects, read_bytes
-from datagen.store.schema import attributes_of
+from datagen.store.schema import MOST_SHARDS, attributes_of
 
 _SEAL = "attributes_sha256"
 _COLUMNS = {
@@ -178,6 +178,8 @@ def stored_manifest(group: zarr.Group) -> Manifest:
         raise TypeError("objects")
     hashes = read_array(group, _OBJECTS, "uint8", (len(paths), 32))
     count = len(read_array(group, "manifest/rows", "int32", (None,)))
+    if count > MOST_SHARDS:
+        raise ValueError(f"{count:,} shards")
     columns = {
         name: read_array(group, f"manifest/{name}", dtype, (count, *shape))
         for name, (dtype, shape, _) in _COLUMNS.items()

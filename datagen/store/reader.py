@@ -328,6 +328,7 @@ def _quick_faults(dataset: Dataset) -> Iterator[str]:
         yield f"{damage.path} is missing or damaged ({damage.reason})"
     elif dataset.committed and not covers(dataset.committed, dataset.arrays):
         yield "its manifest does not list the shards that its recipe has"
+        return
     sizes = stored_sizes(dataset.group, list(dataset.sizes))
     for path, size in dataset.sizes.items():
         if path not in sizes:

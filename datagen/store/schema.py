@@ -31,14 +31,14 @@ from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.codec import LARGEST_CHUNK, ShardCodec
-from datagen.store.objects import open_objects
+from datagen.store.objects import Objects, open_objects
 
 FORMAT_VERSION = 3
 OLDEST_RECIPE = 2
 """The format whose recipes are still understood, so that its datasets can be made anew."""
 _MOST_IDENTITIES = 1_000_000
 _MOST_POSES = 1_000_000
-_MOST_SHARDS = 1_000_000
+MOST_SHARDS = 1_000_000
 _MOST_TRIPLES = 10_000_000
 _MOST_STEPS = 1000
 
@@ -59,11 +59,13 @@ def stored_arrays(group: zarr.Group, grid: Grid) -> GridArrays:
     vertices = read_array(group, "topology/vertex_count", "int32", (None,))
     if vertices.size and not (vertices.min() >= 1 and 12 * int(vertices.max()) <= LARGEST_CHUNK):
         raise ArrayDamage("topology/vertex_count/c/0", f"meshes of {vertices.min():,} to {vertices.max():,} vertices")
+    if len(vertices) > grid.identity_count:
+        raise ArrayDamage("topology/vertex_count/zarr.json", f"{len(vertices):,} topologies")
     topologies = read_array(group, "grid/topology", "int32", (grid.identity_count,))
     if not ((topologies >= 0) & (topologies < len(vertices))).all():
         raise ArrayDamage("grid/topology/c/0", "a topology that is not there")
     arrays = GridArrays(grid, topologies, vertices.tolist())
-    if arrays.shard_count > _MOST_SHARDS:
+    if arrays.shard_count > MOST_SHARDS:
         raise ArrayDamage("topology/vertex_count/c/0", f"{arrays.shard_count:,} shards")
     return arrays
 
@@ -83,9 +85,11 @@ def stored_rig_numbers(group: zarr.Group, arrays: GridArrays, count: int) -> NDA
     if not ((numbers >= -1) & (numbers < count)).all():
         raise ArrayDamage("rig/number/c/0", "a rig that is not there")
     vertices = np.array(arrays.vertices, np.int64)[arrays.topologies]
-    for number in range(count):
-        if len(np.unique(vertices[numbers == number])) != 1:
-            raise ArrayDamage("rig/number/c/0", f"not the identities of rig {number}")
+    least, most = np.full(count + 1, np.iinfo(np.int64).max), np.zeros(count + 1, np.int64)  # the last: of no rig
+    np.minimum.at(least, numbers, vertices)
+    np.maximum.at(most, numbers, vertices)
+    if wrong := np.flatnonzero(least[:count] != most[:count]).tolist():
+        raise ArrayDamage("rig/number/c/0", f"not the identities of rig {wrong[0]}")
     return numbers
 
 
@@ -164,7 +168,7 @@ def check_extent(url: str, recipe: DatasetRecipe) -> None:
 
 def check_shards(url: str, recipe: DatasetRecipe, shards: int) -> None:
     """Refuse more shards than a dataset of this format can hold (DatasetError)."""
-    if shards > _MOST_SHARDS:
+    if shards > MOST_SHARDS:
         raise _too_large(url, recipe, shards)
 
 
@@ -173,7 +177,7 @@ def _too_large(url: str, recipe: DatasetRecipe, shards: int) -> DatasetError:
     return DatasetError(
         f"{url}: its recipe has {grid.identity_count:,} identities, {grid.pose_count:,} poses, {shards:,} shards and "
         f"{triples:,} triples. A dataset holds up to {_MOST_IDENTITIES:,} identities, {_MOST_POSES:,} poses, "
-        f"{_MOST_SHARDS:,} shards and {_MOST_TRIPLES:,} triples; make shards larger (data.store.poses_per_shard), or "
+        f"{MOST_SHARDS:,} shards and {_MOST_TRIPLES:,} triples; make shards larger (data.store.poses_per_shard), or "
         "several datasets"
     )
 
@@ -198,12 +202,21 @@ def open_group(url: str, *, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     except DsffnetError:
         raise
     except FileNotFoundError as error:
-        if store.sizes(["zarr.json"]):  # what is there is neither group nor array
-            raise _unreadable(url, error) from error
+        if store.sizes(["zarr.json"]):  # neither a group nor an array; or another process has just begun a dataset
+            return _begun_since(url, store, mode)
         raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
     except Exception as error:  # whatever Zarr comes to on metadata that is none
+        raise _unreadable(url, error) from error
+
+
+def _begun_since(url: str, store: Objects, mode: Literal["r", "r+"]) -> zarr.Group:
+    try:
+        group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
+        attributes_of(group)
+        return group
+    except Exception as error:
         raise _unreadable(url, error) from error
 
 

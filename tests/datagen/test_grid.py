@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.grid import HOLE, POSE_TYPES, Grid, GridArrays
+from datagen.grid import HOLE, MOST_MESHES, POSE_TYPES, Grid, GridArrays
 from datagen.recipe import DatasetRecipe, Growth
 from tests.support.recipes import tiny_dataset
 
@@ -57,6 +57,7 @@ def test_shards_lie_where_the_arrays_have_their_meshes(recipe: DatasetRecipe) ->
     for array in arrays.arrays:
         height, width = array.room
         assert 1 <= height * width <= max(width, recipe.store.poses_per_shard)
+        assert height * width <= MOST_MESHES
         (first, end), *_ = arrays.grid.pose_spans(array.split)
         assert height == 1 or width == end - first, "several identities only where the poses of one fill no shard"
         for shard in array.shards():

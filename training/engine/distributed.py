@@ -52,7 +52,7 @@ def device_of(recipe: TrainingRecipe, ranks: Ranks) -> torch.device:
     if recipe.device == "cpu" or (recipe.device == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     if not torch.cuda.is_available():
-        raise TrainingError("training.device is 'cuda', but torch sees no CUDA device. Use --set training.device=cpu")
+        raise TrainingError("training.device is 'cuda', but torch sees no CUDA device. Set training.device=cpu")
     torch.cuda.set_device(ranks.local)
     return torch.device("cuda", ranks.local)
 

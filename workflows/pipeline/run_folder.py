@@ -150,7 +150,7 @@ class RunFolder(_Folder):
         RecipeError
             The folder is not a training run's.
         """
-        if self._entries() and not self._is_training():
+        if any(not _matches(path, self.kept) for path in self._entries()) and not self._is_training():
             raise RecipeError(
                 f"{self.path} is not the folder of a training, so --fresh leaves it alone. Choose another --out"
             )

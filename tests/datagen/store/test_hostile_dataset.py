@@ -18,9 +18,11 @@ from numcodecs import Zstd
 
 from datagen.common.errors import DatasetError, DsffnetError
 from datagen.generate import append, generate, repair
-from datagen.store import open_dataset
-from datagen.store.object_names import is_member
+from datagen.store import arrays, open_dataset
+from datagen.store.arrays import put_array
+from datagen.store.object_names import is_leftover, is_member
 from datagen.store.objects import LocalObjects
+from datagen.store.schema import open_group
 from datagen.store.verify import describe, find_faults, require_recipe
 from tests.support.damage.datasets import edit, sealed
 from tests.support.files import tree_hash
@@ -222,6 +224,10 @@ MENDED = [
     pytest.param(numbers("rig/0/kind", -1), id="kind of weights -1"),
     pytest.param(attributes(rigs=[{"names": ["a"], "parents": [0], "drivers": [0]}]), id="a part that hangs on itself"),
     pytest.param(attributes(rigs=[{"names": ["a"], "parents": [-1], "drivers": [24]}]), id="a driver of no joint"),
+    pytest.param(
+        attributes(rigs=[{"names": ["a"] * 3000, "parents": [*range(-1, 2999)], "drivers": [0] * 3000}]),
+        id="a chain of 3000 parts",
+    ),
     # links, devices, pipes
     pytest.param(link(SHARD, "victim/thesis.txt"), id="shard: link out"),
     pytest.param(link(SHARD, "/dev/zero"), id="shard: /dev/zero"),
@@ -480,3 +486,25 @@ def test_paths_that_no_object_has(path: str) -> None:
 def test_every_file_of_a_dataset_is_one_of_its_objects(dataset: str) -> None:
     files = [str(path.relative_to(dataset)) for path in Path(dataset).rglob("*") if path.is_file()]
     assert len(files) > 40 and all(map(is_member, files))
+    leftovers = [f"{path.removesuffix('.json')}.0123abcd.partial" for path in files if path.endswith("zarr.json")]
+    assert leftovers and all(map(is_leftover, leftovers)), "what a killed writer leaves of any of them is removed"
+
+
+def test_an_array_that_no_reader_takes_is_not_written(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrays, "LARGEST_CHUNK", 100)
+    with pytest.raises(DatasetError, match=r"pose/parameters would have 104 bytes.*several datasets"):
+        put_array(open_group(str(spoilable), mode="r+"), "pose/parameters", np.zeros(13), ("pose",))
+
+
+def test_a_dataset_that_begins_while_it_is_looked_for_is_opened(dataset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process writes zarr.json after Zarr has found none."""
+    real, asked = zarr.open_group, []
+
+    def not_yet(*arguments: Any, **options: Any) -> zarr.Group:
+        asked.append(arguments)
+        if len(asked) == 1:
+            raise FileNotFoundError("zarr.json")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(zarr, "open_group", not_yet)
+    assert open_group(dataset).attrs["status"] == "complete"

@@ -92,3 +92,11 @@ def test_the_folder_of_another_kind_of_work_is_left_alone(tmp_path: Path, kind: 
     with pytest.raises(RecipeError, match=f"holds files, but no {kind.kind} of ours, so --fresh leaves it alone"):
         kind(tmp_path).remove()
     assert (tmp_path / "trials").is_dir()
+
+
+def test_a_training_is_begun_afresh_where_nothing_is(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "new")
+    for _ in range(2):  # the second time only the lock is there
+        with run.alone():
+            run.remove()
+    assert run.lock.exists()

@@ -1,5 +1,5 @@
-// Source of viewer.bundle.js, which training/viewer.py writes into every page. To rebuild (three 0.187.0, esbuild 0.28.2):
-//   cd training/assets && npm install && npm run build && rm -rf node_modules package-lock.json
+// Source of viewer.bundle.js, which training/viz/viewer.py writes into every page. To rebuild (three 0.187.0, esbuild 0.28.2):
+//   cd training/viz/assets && npm install && npm run build && rm -rf node_modules package-lock.json
 // One WebGL context draws all panels, each through its own scissor rectangle: browsers allow only a few contexts a page.
 import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
