@@ -97,7 +97,7 @@ def family(process: subprocess.Popen[str], title: str) -> list[psutil.Process]:
 
 
 def shards(out: Path) -> int:
-    return len(list((out / "dataset.zarr").rglob("vertices/c/*/0/0")))
+    return len(list((out / "dataset.zarr").rglob("vertices/c/*/*/0/0")))
 
 
 def trained_steps(out: Path) -> int:
