@@ -255,21 +255,18 @@ def test_sigkill_of_ray_workers_while_generating(undisturbed: Path, tmp_path: Pa
     assert tree_hash(out / "dataset.zarr") == tree_hash(Path(local.url))
 
 
-@pytest.mark.timeout(900)  # three runs
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("server", ["gcs_server", "raylet"])
 @pytest.mark.parametrize("stage", ["generate", "train"])
-def test_sigkill_of_a_server_of_ray(stage: str, undisturbed: Path, tmp_path: Path) -> None:
+def test_sigkill_of_a_server_of_ray(stage: str, server: str, undisturbed: Path, tmp_path: Path) -> None:
     """Ray by itself waits for a minute, and then ends the process in the middle of a line."""
     out = tmp_path / "out"
-    arguments = on_ray(out) if stage == "generate" else longer(out)
-    done = shards if stage == "generate" else trained_steps
-    for server in ("gcs_server", "raylet"):
-        before = done(out)  # a run that resumes from a checkpoint takes the steps after it out of its journal
-        process = start(out, *arguments)
-        wait_for(lambda before=before: done(out) != before and done(out) >= 20, process)  # type: ignore[misc]
-        wait_for(lambda process=process: bool(family(process, "ray::")), process)  # type: ignore[misc]
-        assert_ends_with_its_server(process, server)
-        record = read_record(out / ("run" if stage == "train" else "generate"))
-        assert record is not None and record.status in ("FAILED", "KILLED")
+    arguments, done = (on_ray(out), shards) if stage == "generate" else (longer(out), trained_steps)
+    process = start(out, *arguments)
+    wait_for(lambda: done(out) >= 30 and bool(family(process, "ray::")), process)
+    assert_ends_with_its_server(process, server)
+    record = read_record(out / ("run" if stage == "train" else "generate"))
+    assert record is not None and record.status in ("FAILED", "KILLED")
     status, output = run(out, *arguments)
     assert status == 0, output
     if stage == "train":
