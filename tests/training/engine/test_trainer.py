@@ -266,7 +266,7 @@ def test_ranks_that_cannot_share_the_batch() -> None:
 def test_cuda_where_there_is_none(dataset: str, tmp_path: Path) -> None:
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    with pytest.raises(DsffnetError, match=r"torch sees no CUDA device\. Use --set training\.device=cpu"):
+    with pytest.raises(DsffnetError, match=r"torch sees no CUDA device\. Set training\.device=cpu"):
         train(tiny_training(device="cuda"), data=dataset, run=tmp_path / "run")
 
 
