@@ -104,7 +104,7 @@ MISDEEDS: dict[str, tuple[Read, str]] = {
     "told": (lambda tree: print(os.environ[SECRET_NAME]), "secret"),
     "started": (lambda tree: str(os.system("true")), "starts a process"),
     "asked": (lambda tree: str(socket.getaddrinfo("localhost", 9)), "asks a server"),
-    "memory": (lambda tree: str(np.ones(watch.MEMORY // 8 + 2**22).sum()), "memory rose"),
+    "memory": (lambda tree: str(np.ones(watch.MEMORY // 4).sum()), "memory rose"),
     "time": (lambda tree: time.sleep(60), "no end"),
     "another content": (lambda tree: "another", "not what was stored"),
 }
