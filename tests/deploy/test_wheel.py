@@ -62,6 +62,5 @@ def test_commands_find_their_recipes(site: Path) -> None:
 def test_two_meshes_with_the_weights_that_come_with_the_project(site: Path, tmp_path: Path) -> None:
     vertices = [[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 1]]
     save_mesh(Mesh(vertices, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), tmp_path / "a.obj")
-    model = ROOT / "pretrained" / "anny-quickstart"
-    dsffnet(site, "transfer", tmp_path / "a.obj", tmp_path / "a.obj", "-o", tmp_path / "b.obj", "--model", model)
+    dsffnet(site, "transfer", tmp_path / "a.obj", tmp_path / "a.obj", "-o", tmp_path / "b.obj")
     assert load_mesh(tmp_path / "b.obj").vertices.shape == (4, 3)

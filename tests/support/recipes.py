@@ -45,6 +45,15 @@ def tiny_training(**changes: Any) -> TrainingRecipe:
     return TrainingRecipe.model_validate(values | changes)
 
 
+LEG: dict[str, str | None] = {"left_hip": None, "left_knee": "left_hip"}
+"""The joints of a leg, for the parts network."""
+
+PARTS: dict[str, Any] = {
+    "network": {"name": "parts", "joints": LEG, "width": 8, "token_width": 8, "blocks": 1},
+    "augmentation": {"subset": 24},
+}
+"""The parts network in a :func:`tiny_training`."""
+
 MIXED_COUNTS = (32, 30, 30)
 """Vertices of identities 0, 1, 2, then again; the last two have equal counts and different faces."""
 

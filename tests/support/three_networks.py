@@ -15,6 +15,7 @@ from tests.literal.npt import LiteralNPT
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
+from training.networks.parts import Parts
 from training.networks.released_weights import released_names
 
 FORMS: dict[str, Callable[..., nn.Module]] = {
@@ -22,7 +23,9 @@ FORMS: dict[str, Callable[..., nn.Module]] = {
     "npt maxpool": NPT,
     "npt origin": lambda **options: NPT(variant="origin", **options),
     "corenet3d": CoreNet3D,
+    "parts": lambda **options: Parts(**{"joints": FOUR_JOINTS} | options),
 }
+FOUR_JOINTS = {"pelvis": None, "spine": "pelvis", "head": "spine", "left_leg": "pelvis"}
 LITERAL: dict[str, Callable[[Any], nn.Module]] = {
     "dsffnet": LiteralDSFFNet,
     "npt maxpool": LiteralNPT,
@@ -36,11 +39,13 @@ _NARROW: dict[str, dict[str, Any]] = {
     "dsffnet": {"encoder_widths": (8, 16, 24), "decoder_widths": (16, 32, 16)},
     "npt": {"encoder_widths": (8, 16, 29)},
     "corenet3d": {"feature_widths": (8, 8, 16), "generator_widths": (32, 16, 16)},
+    "parts": {"width": 16, "token_width": 8, "blocks": 2},
 }
 _WIDE: dict[str, dict[str, Any]] = {
     "dsffnet": {"encoder_widths": (32, 64, 256), "decoder_widths": (64, 256, 64)},
     "npt": {"encoder_widths": (32, 64, 253)},
     "corenet3d": {"feature_widths": (32, 64, 64), "generator_widths": (256, 128, 64)},
+    "parts": {"width": 64, "token_width": 32, "blocks": 2},
 }
 
 

@@ -1,10 +1,11 @@
-"""Random changes of a training batch: another subset of the source's vertices each time, and noise on them.
+"""Random changes of a training batch: meshes turned about the vertical, subsets of their vertices, noisy sources.
 
 The paper trains without. Shuffling vertices changes nothing for DSFFNet and NPT, which are invariant to the source's
 order and equivariant to the target's. The generator of 3D-CoreNet has a kernel of three along the list of the target's
 vertices: it learns from the order that a body model happens to list them in, unless they are shuffled.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
-from training.recipes.training import TrainingRecipe
+from training.networks.layers.rigid_parts import matrices
+from training.objectives.losses import PackedEdges
+from training.recipes.training import PartsRecipe, TrainingRecipe
 
 
 class Augmentation:
@@ -23,11 +26,11 @@ class Augmentation:
     """
 
     def __init__(self, recipe: TrainingRecipe) -> None:
-        self._vertices, self._noise = recipe.augmentation.vertices, recipe.augmentation.source_noise
-        self._seed = recipe.seed
+        self._recipe, self._seed = recipe.augmentation, recipe.seed
+        self._draws_edges = not isinstance(recipe.network, PartsRecipe)  # it has no edge loss
 
     def __call__(self, batch: Batch, *, step: int, first: int) -> Batch:
-        """The batch with its sources changed.
+        """The batch changed: turned, then thinned, then noisy.
 
         Parameters
         ----------
@@ -36,26 +39,128 @@ class Augmentation:
         first
             Place of the batch's first triple in the whole batch (:meth:`training.data.triples.TripleOrder.places`).
         """
-        if self._vertices == 1 and self._noise == 0:
+        recipe = self._recipe
+        if not (recipe.turn or recipe.subset or recipe.vertices < 1 or recipe.source_noise):
             return batch
-        counts = batch.source_counts or (batch.source.shape[1],) * len(batch.source)
-        sources = [
-            self._changed(mesh[:count], step=step, place=first + row)
-            for row, (mesh, count) in enumerate(zip(batch.source, counts, strict=True))
-        ]
-        source, kept = _padded(sources)
-        return replace(batch, source=source, source_counts=kept)
+        device = batch.source.device
+        random = [_generator(self._seed, step, first + row, device) for row in range(len(batch))]
+        if recipe.turn:
+            batch = _turned(batch, np.radians(recipe.turn), random)
+        if recipe.vertices < 1:
+            batch = _some_of_the_source(batch, recipe.vertices, random)
+        if recipe.subset:
+            batch = self._subset(batch, recipe.subset, random)
+        if recipe.source_noise:
+            batch = _noisy(batch, recipe.source_noise, random)
+        return batch
 
-    def _changed(self, mesh: Tensor, *, step: int, place: int) -> Tensor:
-        """One source [n, 3]: a random subset in its own order, and noise."""
-        random = _generator(self._seed, step, place, mesh.device)
-        if self._vertices < 1:
-            kept = max(1, round(self._vertices * len(mesh)))
-            subset = torch.randperm(len(mesh), generator=random, device=mesh.device)[:kept]
-            mesh = mesh[subset.sort().values]
-        if self._noise:
-            mesh = mesh + self._noise * torch.randn(mesh.shape, generator=random, device=mesh.device)
-        return mesh
+    def _subset(self, batch: Batch, size: int, random: Sequence[torch.Generator]) -> Batch:
+        """So many vertices of each source and each target; more often than once where a mesh has fewer."""
+        targets = batch.target_counts or (batch.target.shape[1],) * len(batch)
+        source = torch.stack([_drawn(count, size, own) for count, own in zip(_counts(batch), random, strict=True)])
+        drawn = [
+            self._target(_edges_of(batch, row) if self._draws_edges else _NO_EDGES, count, size, own)
+            for row, (count, own) in enumerate(zip(targets, random, strict=True))
+        ]
+        target, pairs = torch.stack([rows for rows, _ in drawn]), [own for _, own in drawn]
+        meshes = torch.cat([torch.full_like(own[:, 0], mesh) for mesh, own in enumerate(pairs)])
+        packed = PackedEdges(torch.cat([own + size * mesh for mesh, own in enumerate(pairs)]), meshes)
+        return replace(
+            batch,
+            source=_taken(batch.source, source),
+            target=_taken(batch.target, target),
+            truth=_taken(batch.truth, target),
+            edges=packed,
+            source_counts=None,
+            target_counts=None,
+            source_rows=source,
+            target_rows=target,
+        )
+
+    def _target(self, edges: Tensor, count: int, size: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Vertices [size] of a target, and edges [e, 2] by their places there: a quarter as many, with their ends.
+
+        Of a target that has no more vertices than that all are taken, with all edges.
+        """
+        if not self._draws_edges:
+            return _drawn(count, size, random), edges[:0]
+        if count <= size:
+            rows = _drawn(count, size, random)
+            return rows, torch.argsort(rows[:count])[edges]
+        chosen = edges[torch.randint(len(edges), (size // 4,), generator=random, device=edges.device)]
+        ends = torch.unique(chosen)
+        others = torch.randperm(count, generator=random, device=edges.device)
+        rows = torch.cat([ends, others[~torch.isin(others, ends)][: size - len(ends)]])
+        return rows, torch.searchsorted(ends, chosen)
+
+
+_NO_EDGES = torch.empty((0, 2), dtype=torch.int64)
+
+
+def _counts(batch: Batch) -> Counts:
+    return batch.source_counts or (batch.source.shape[1],) * len(batch.source)
+
+
+def _taken(vertices: Tensor, rows: Tensor) -> Tensor:
+    return vertices.gather(1, rows[..., None].expand(-1, -1, 3))
+
+
+def _drawn(count: int, size: int, random: torch.Generator) -> Tensor:
+    """So many numbers below ``count``, none twice where there are enough."""
+    order = torch.randperm(count, generator=random, device=random.device)
+    more = torch.randint(count, (max(0, size - count),), generator=random, device=random.device)
+    return torch.cat([order[:size], more])
+
+
+def _edges_of(batch: Batch, row: int) -> Tensor:
+    """Edges [e, 2] of one of the targets, by its own vertices."""
+    if isinstance(batch.edges, PackedEdges):
+        return batch.edges.part(row, row + 1, rows=batch.target.shape[1]).pairs
+    return batch.edges
+
+
+def _some_of_the_source(batch: Batch, fraction: float, random: Sequence[torch.Generator]) -> Batch:
+    """A random subset of each source, in its own order."""
+    sources = []
+    for mesh, count, own in zip(batch.source, _counts(batch), random, strict=True):
+        kept = max(1, round(fraction * count))
+        sources.append(mesh[torch.randperm(count, generator=own, device=mesh.device)[:kept].sort().values])
+    counts = counts_of(np.array([len(mesh) for mesh in sources]))
+    return replace(batch, source=torch.nn.utils.rnn.pad_sequence(sources, batch_first=True), source_counts=counts)
+
+
+def _noisy(batch: Batch, deviation: float, random: Sequence[torch.Generator]) -> Batch:
+    source = batch.source.clone()
+    for mesh, count, own in zip(source, _counts(batch), random, strict=True):
+        mesh[:count] += deviation * torch.randn((count, 3), generator=own, device=mesh.device)
+    return replace(batch, source=source)
+
+
+def _turned(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
+    """Source and target each turned about the vertical, the truth as the source; all in their new boxes."""
+    device = batch.source.device
+    angles = torch.stack([torch.rand(2, generator=own, device=device) for own in random]) * 2 - 1
+    cosine, sine, zero = torch.cos(most * angles), torch.sin(most * angles), torch.zeros_like(angles)
+    rows = [cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine]
+    turns = matrices(torch.stack(rows, dim=2)).to(batch.source.dtype)
+    source, target = turns.unbind(1)
+    return replace(
+        batch,
+        source=_boxed(batch.source @ source.mT, batch.source_counts),
+        target=_boxed(batch.target @ target.mT, batch.target_counts),
+        truth=_boxed(batch.truth @ source.mT, batch.target_counts),
+    )
+
+
+def _boxed(meshes: Tensor, counts: Counts | None) -> Tensor:
+    """Meshes [b, n, 3] in their own boxes; rows after a mesh' count stay zero."""
+    if counts is None:
+        low, high = meshes.aminmax(dim=1, keepdim=True)
+        return (meshes - (low + high) / 2) / ((high - low) / 2).amax(dim=2, keepdim=True)
+    out = torch.zeros_like(meshes)
+    for row, count in enumerate(counts):
+        out[row, :count] = _boxed(meshes[row : row + 1, :count], None)[0]
+    return out
 
 
 class Shuffle:
@@ -93,8 +198,3 @@ _SHUFFLED = 2**63  # less a vertex count: no place of a triple in a batch
 def _generator(seed: int, step: int, place: int, device: torch.device) -> torch.Generator:
     state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step, place)).generate_state(1, np.uint64)
     return torch.Generator(device).manual_seed(int(state[0]))
-
-
-def _padded(meshes: list[Tensor]) -> tuple[Tensor, Counts | None]:
-    counts = counts_of(np.array([len(mesh) for mesh in meshes]))
-    return torch.nn.utils.rnn.pad_sequence(meshes, batch_first=True), counts

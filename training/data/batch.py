@@ -15,6 +15,7 @@ from training.data.triples import Triples
 from training.data.vertex_layout import normalised
 from training.objectives.edge_incidence import INCIDENCES, incidence_of, join_incidences
 from training.objectives.losses import PackedEdges, loss_edges
+from training.objectives.parts import Posed
 
 Counts = tuple[int, ...]
 EdgeSum = Literal["edges", "faces"]
@@ -33,6 +34,10 @@ class Batch:
     source_counts, target_counts
         Vertices of each mesh, for :class:`training.networks.padded_batches.MixedCounts`; None: all n. The truth has the
         target's.
+    source_rows, target_rows
+        ``[b, n]``, numbers of the vertices that were taken of each mesh; None: all.
+    posed
+        Of a network that learns from rigs: how the sources are posed, and the targets.
     """
 
     source: Tensor
@@ -41,13 +46,21 @@ class Batch:
     edges: Tensor | PackedEdges
     source_counts: Counts | None = None
     target_counts: Counts | None = None
+    source_rows: Tensor | None = None
+    target_rows: Tensor | None = None
+    posed: tuple[Posed, Posed] | None = None
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
         """The same on another device."""
         meshes = (self.source, self.target, self.truth)
         source, target, truth = (mesh.to(device, non_blocking=non_blocking) for mesh in meshes)
         edges = self.edges.to(device, non_blocking=non_blocking)
-        return Batch(source, target, truth, edges, self.source_counts, self.target_counts)
+        of_source, of_target = (
+            rows if rows is None else rows.to(device) for rows in (self.source_rows, self.target_rows)
+        )
+        posed = self.posed and (self.posed[0].to(device), self.posed[1].to(device))
+        counts = self.source_counts, self.target_counts
+        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -55,10 +68,11 @@ class Batch:
     def in_dtype(self, dtype: torch.dtype) -> "Batch":
         """The same with vertices in another floating type."""
         meshes = {name: getattr(self, name).to(dtype) for name in ("source", "target", "truth")}
-        return replace(self, **meshes)
+        posed = self.posed and (self.posed[0].in_dtype(dtype), self.posed[1].in_dtype(dtype))
+        return replace(self, **meshes, posed=posed)
 
     def part(self, start: int, stop: int) -> "Batch":
-        """Its triples from ``start`` to ``stop``."""
+        """Its triples from ``start`` to ``stop``, for a network to be run on: without what a step learns from."""
         edges = self.edges
         if isinstance(edges, PackedEdges):
             edges = edges.part(start, stop, rows=self.target.shape[1])

@@ -32,6 +32,7 @@ def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, room: Room, *,
         It does; the message names what to lower.
     """
     most = max((dataset.vertex_count(identity) for identity in dataset.identities("training")), default=0)
+    most = recipe.augmentation.subset or most
     meshes = math.ceil(recipe.batch / (ranks * recipe.accumulate))
     widths = _widths(recipe.network)
     weights = room.sharers * _PARAMETER * _parameters(recipe.network)
@@ -49,7 +50,8 @@ def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, room: Room, *,
 
 def _widths(network: NetworkRecipe) -> list[int]:
     values = network.model_dump().items()
-    return [width for name, widths in values if name.endswith("_widths") for width in widths]
+    lists = [width for name, widths in values if name.endswith("_widths") for width in widths]
+    return lists + [width for name, width in values if name.endswith("width")]
 
 
 def _parameters(network: NetworkRecipe) -> float:

@@ -19,15 +19,13 @@ from torch.nn.parallel import DistributedDataParallel
 
 from training.checkpoints.checkpoint import Checkpoint
 from training.checkpoints.weights import fill_network
-from training.data.augmentation import Shuffle
 from training.data.batch import Batch
 from training.engine.distributed import Ranks
+from training.engine.objective import objective_of
 from training.engine.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
 from training.inference.predict import load_weights
 from training.networks import network_from
-from training.networks.execution import autocast, compiled, products
-from training.networks.padded_batches import MixedCounts
-from training.objectives.losses import transfer_loss
+from training.networks.execution import products
 from training.recipes.training import TrainingRecipe
 
 
@@ -117,39 +115,15 @@ class Learner:
             self.average.load_state_dict({"updates": state["averaged"], "weights": checkpoint.weights(average=True)})
 
     def _backward(self, batch: Batch, weight: float, *, last: bool) -> dict[str, Tensor]:
-        batch = batch.in_dtype(self.dtype)
         with self._in_step_with_others(last):
-            with autocast(self.recipe.precision, self.device):
-                prediction = self._predict(batch)
-            loss, parts = transfer_loss(
-                prediction,
-                truth=batch.truth,
-                target=batch.target,
-                edges=batch.edges,
-                counts=batch.target_counts,
-                recipe=self.recipe,
-            )
-            (loss * weight).backward()  # type: ignore[no-untyped-call]
-        return {**parts, "total": loss.detach()}
-
-    def _predict(self, batch: Batch) -> Tensor:
-        if not self.recipe.augmentation.shuffle:
-            return self._output(batch, batch.target)
-        shuffle = Shuffle(batch, seed=self.recipe.seed, step=self.schedule.done)
-        return shuffle.undone(self._output(batch, shuffle(batch.target)))
-
-    def _output(self, batch: Batch, target: Tensor) -> Tensor:
-        counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
-        found: Tensor = self.model(source=batch.source, target=target, **counts)
-        return found
+            losses = self.model(batch.in_dtype(self.dtype), step=self.schedule.done)
+            (losses["total"] * weight).backward()
+        return {name: loss.detach() for name, loss in losses.items()}
 
     @functools.cached_property
     def model(self) -> nn.Module:
-        """The network as the step calls it: compiled, over any vertex counts, averaging gradients over ranks.
-
-        Made at the first step, after a checkpoint was loaded.
-        """
-        model = MixedCounts(compiled(self.network, self.device) if self.recipe.compile else self.network)
+        """The objective that a step calls, averaging gradients over ranks. Made at the first step, after loading."""
+        model = objective_of(self.network, self.recipe, self.device)
         return DistributedDataParallel(model) if self._ranks.count > 1 else model
 
     def _in_step_with_others(self, last: bool) -> contextlib.AbstractContextManager[Any]:

@@ -40,6 +40,7 @@ from training.engine.distributed import (
     random_state,
 )
 from training.engine.nonfinite import RecentStep, broken_step, stop_for
+from training.engine.objective import Supervise, supervision_of
 from training.engine.resume import begin, checkpoint_to_resume
 from training.engine.state import Job, State
 from training.engine.step_memory import require_step_memory
@@ -154,6 +155,7 @@ def _learn(job: Job, device: torch.device, stop: StopRequest, newest: Checkpoint
     with contextlib.ExitStack() as around:
         bank = agreed(ranks, lambda: _opened_bank(job, device), what="open the training meshes")
         around.callback(bank.close)
+        supervise = agreed(ranks, lambda: supervision_of(job.recipe, job.dataset, device), what="read the rigs")
         observer = agreed(
             ranks,
             lambda: around.enter_context(observing(job, state.learner, meter, bank.where)) if ranks.rank == 0 else None,
@@ -161,7 +163,7 @@ def _learn(job: Job, device: torch.device, stop: StopRequest, newest: Checkpoint
         )
         (told,) = any_rank([stop.made()], ranks)  # while meshes were decoded
         reason = StopReason.TOLD if told else None
-        batches = _batches(job, bank, state.step)
+        batches = _batches(job, bank, supervise, state.step)
         while state.step < job.last_step and reason is None:
             with meter.waiting():
                 triples, parts = next(batches)
@@ -216,13 +218,18 @@ def _opened_bank(job: Job, device: torch.device) -> VertexBank:
     return open_bank(job.dataset, identities, edge_sum=recipe.edge_sum, **placed)
 
 
-def _batches(job: Job, bank: VertexBank, first_step: int) -> Iterator[tuple[list[Triples], list[Batch]]]:
+def _batches(
+    job: Job, bank: VertexBank, supervise: Supervise, first_step: int
+) -> Iterator[tuple[list[Triples], list[Batch]]]:
     """This rank's share of every step's triples, in parts, and their meshes on the device."""
     mine = {"rank": job.ranks.rank, "ranks": job.ranks.count, "parts": job.recipe.accumulate}
     places, augment = job.order.places(**mine), Augmentation(job.recipe)
     for step, share in enumerate(bank.prefetch(job.order.batches(first_step=first_step, **mine)), first_step):
         parts = zip(share, places, strict=True)
-        yield share, [augment(bank.batch(triples), step=step, first=first) for triples, first in parts]
+        yield (
+            share,
+            [supervise(triples, augment(bank.batch(triples), step=step, first=first)) for triples, first in parts],
+        )
 
 
 def _save(job: Job, state: State, observer: Observer | None, *, finished: bool, best: bool) -> None:

@@ -8,13 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from training.recipes.training import CoreNet3dRecipe, NetworkRecipe, NptRecipe
+from training.recipes.training import CoreNet3dRecipe, NetworkRecipe, NptRecipe, PartsRecipe
 
 PaperData = Literal["SMPL", "SMAL"]
 """Humans and animals of the paper."""
 
 DSFFNET, NPT, CORENET3D = "DSFFNet", "NPT", "3D-CoreNet"
 """The three networks, by the paper's names."""
+PARTS = "Parts (learned from rigs)"
+"""No paper's: its supervision is said wherever its name is."""
 
 WITHOUT_FUSION, WITHOUT_TARGET_SIDE, WITHOUT_EDGE_LOSS = "w/o FFAdaIN", "w/o side target", "w/o L_edge"
 """The ablations of DSFFNet, by the paper's names (Table 3)."""
@@ -80,6 +82,8 @@ TABLE_3: Mapping[str, SeenUnseen] = {
 
 def method_name(network: NetworkRecipe) -> str:
     """What tables call a network, by its recipe: the paper's name, with what is left out or differs behind it."""
+    if isinstance(network, PartsRecipe):
+        return PARTS
     if isinstance(network, CoreNet3dRecipe):
         return CORENET3D
     if isinstance(network, NptRecipe):

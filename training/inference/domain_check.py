@@ -18,6 +18,7 @@ from datagen.common.arrays import Floats
 from datagen.common.errors import DsffnetError
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from training.inference.orientation import POOR_ERROR, TURN, Axes, Orientation, axes_as_options
+from training.inference.standing import STRANGE, Standing
 from training.tracking.provenance import FILE, Provenance, provenance_of
 
 if TYPE_CHECKING:
@@ -91,7 +92,14 @@ def _spread(count: int, wanted: int) -> NDArray[np.int64]:
 
 
 def remarks(
-    mesh: Mesh, *, name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes], stated: bool, seen: Seen | None
+    mesh: Mesh,
+    *,
+    name: str,
+    axes: Axes | Standing,
+    way: Orientation | None,
+    both: tuple[Axes, Axes] | None,
+    stated: bool,
+    seen: Seen | None,
 ) -> Iterator[str]:
     """One line for everything about a mesh that its network has not met.
 
@@ -103,17 +111,31 @@ def remarks(
         What the lines call it.
     axes, way, both, stated
         How it is taken to stand, how well it comes back in every way of standing, how source and target seem to stand,
-        and whether a person said how.
+        and whether a person said how. A network that finds by itself how meshes stand needs neither way nor both.
     seen
         What the network saw, None where that is not known.
     """
     upright = axes.turned(mesh.vertices)
-    fits = way.error(axes) <= POOR_ERROR if stated else way.fits(axes)
+    if isinstance(axes, Standing):
+        fits, line = axes.misfit <= STRANGE, _about_a_stranger(name, axes)
+    elif way is None:
+        fits, line = True, ""
+    else:
+        fits = way.error(axes) <= POOR_ERROR if stated else way.fits(axes)
+        line = "" if fits else _about_standing(name, axes, way, None if stated else both)
     if not fits:
-        yield _about_standing(name, axes, way, None if stated else both)
+        yield line
     yield from _about_parts(name, mesh)
     yield from _about_box(name, upright, seen if fits else None)
-    yield from _about_count(name, len(upright), seen)
+    if not isinstance(axes, Standing):  # a network that reads a sample of the surface does not mind
+        yield from _about_count(name, len(upright), seen)
+
+
+def _about_a_stranger(name: str, found: Standing) -> str:
+    return (
+        f"{name} is unlike the bodies of training, however it is turned (misfit {found.misfit:.4f}, above "
+        f"{STRANGE}). The result may be poor; look at --picture"
+    )
 
 
 def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, Axes] | None) -> str:

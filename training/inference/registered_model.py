@@ -60,7 +60,9 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         )
         return np.asarray(posed.vertices)
 
-    def _axes(self, source: Mesh, target: Mesh, wanted: Mapping[str, Any]) -> tuple[Axes, Axes]:
+    def _axes(self, source: Mesh, target: Mesh, wanted: Mapping[str, Any]) -> tuple[Axes | None, Axes | None]:
+        if self._transfer.finds_standing and (wanted["up"], wanted["front"]) == ("Y", "Z"):
+            return None, None
         if not wanted["align"]:
             return axes_of_both(str(wanted["up"]), str(wanted["front"]))
         return self._found(source, "source"), self._found(target, "target")

@@ -8,7 +8,7 @@ of the ground, so that a body that sits down sits on the ground on which it stoo
 paper's normalisation suggests, would let it float at the height of its hips.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,15 @@ from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
+from training.inference.standing import Standing, facing, misfit, standing, understanding_of
 from training.networks.execution import GraphedTransfer, Precision
+from training.networks.parts import Parts
 from training.objectives.metrics import point_mesh_distance
 
 _VERTICES_AT_ONCE = 8192  # of self-transfers, so that memory stays bounded
 REFINE_WEIGHT = 6.0
 """The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/transfer.md)."""
+Stands = Axes | Standing | None
 _NO_LENGTH = 1e-9  # of the normalised box: an edge that has none says nothing of the scale
 
 
@@ -43,6 +46,7 @@ class PoseTransfer:
     def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:
         """Use a network where it is; on a GPU shapes that come again are replayed (see :class:`GraphedTransfer`)."""
         self._transfer = GraphedTransfer(network.eval(), precision=precision)
+        self._network = network
         self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
 
     @classmethod
@@ -59,8 +63,8 @@ class PoseTransfer:
         *,
         source: Mesh,
         target: Mesh,
-        source_axes: Axes = UPRIGHT,
-        target_axes: Axes = UPRIGHT,
+        source_axes: Stands = None,
+        target_axes: Stands = None,
         refine: float = 0.0,
     ) -> Mesh:
         """The target's identity in the source's pose.
@@ -70,7 +74,8 @@ class PoseTransfer:
         source, target
             Meshes that may differ in vertices, faces, size and position.
         source_axes, target_axes
-            How each of them stands; by default as the training data does, Y up and facing +Z.
+            How each of them stands; by default as the network finds, where it can (`finds_standing`), else as the
+            training data does, Y up and facing +Z.
         refine
             Weight of the target's edges in :class:`training.inference.refinement.Refinement`; 0 leaves the network's
             output.
@@ -96,8 +101,8 @@ class PoseTransfer:
         *,
         smooth: int = 0,
         refine: float = 0.0,
-        source_axes: Axes = UPRIGHT,
-        target_axes: Axes = UPRIGHT,
+        source_axes: Stands = None,
+        target_axes: Stands = None,
     ) -> Iterator[Mesh]:
         """Yield the target in the pose of each source, one after the other; memory holds one window of frames.
 
@@ -122,6 +127,7 @@ class PoseTransfer:
             While iterating: a mesh cannot be used.
         """
         check_mesh(target, name="target")
+        target_axes = target_axes or self.standing([target.vertices])
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
         frames = self._frames(sources, upright, source_axes)
         if smooth:
@@ -159,12 +165,34 @@ class PoseTransfer:
         ]
         return torch.cat(found).double().cpu().numpy()
 
-    def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Axes) -> Iterator[Floats]:
+    @property
+    def finds_standing(self) -> bool:
+        """Whether the network says how well it understands a mesh, so that meshes are turned without being asked."""
+        return isinstance(self._network, Parts)
+
+    def standing(self, meshes: Sequence[Floats]) -> Axes | Standing:
+        """How meshes [n, 3] stand that stand alike (frames), where the network can say; else as the training data."""
+        return standing(understanding_of(self._network), meshes) if isinstance(self._network, Parts) else UPRIGHT
+
+    def misfit(self, vertices: Floats) -> float:
+        """How badly a network that finds how meshes stand understands one [n, 3], Y up (`training.networks.parts`)."""
+        assert isinstance(self._network, Parts)
+        return misfit(understanding_of(self._network), vertices)
+
+    def _turned_round(self, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The turn about the vertical [3, 3] by which a frame faces, if the network can say; ``before``: the last."""
+        return facing(understanding_of(self._network), vertices, before) if isinstance(self._network, Parts) else before
+
+    def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Stands) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up."""
         trajectory: RootTrajectory | None = None
+        turn = np.eye(3)
         for number, source in enumerate(sources):
-            vertices = axes.turned(check_mesh(source, name=f"source {number}").vertices)
-            output = self.vertices(vertices, target.vertices)
+            vertices = check_mesh(source, name=f"source {number}").vertices
+            axes = axes or self.standing([vertices])  # that of the first frame: the others may turn round
+            vertices = axes.turned(vertices)
+            turn = self._turned_round(vertices, turn)
+            output = self.vertices(vertices @ turn, target.vertices) @ turn.T
             trajectory = trajectory or RootTrajectory.from_first(vertices, scale_of(target, output))
             yield placed(target, output) + trajectory.offset(vertices)
 

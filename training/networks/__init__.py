@@ -11,12 +11,14 @@ from torch import nn
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
+from training.networks.parts import Parts
 from training.recipes.training import NetworkRecipe
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
     "corenet3d": CoreNet3D,
     "dsffnet": DSFFNet,
     "npt": NPT,
+    "parts": Parts,
 }
 """Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both.
 

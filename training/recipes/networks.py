@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from datagen.recipe import Frozen
 
@@ -58,10 +58,48 @@ class CoreNet3dRecipe(Frozen):
     centre_features: bool = Field(False, description="centre features over channels before they are compared")
 
 
-NETWORK_NAMES = ("dsffnet", "npt", "corenet3d")
+class PartsRecipe(Frozen):
+    """The parts network, which learns from datasets with rigs; no paper's."""
+
+    name: Literal["parts"] = "parts"
+    joints: dict[str, str | None] = Field(
+        default_factory=lambda: dict(PEOPLE),
+        description="joints that turn the parts, each with its parent's name; default: SMPL's 24",
+    )
+    width: int = Field(128, ge=1, description="channels of the vertices' features")
+    token_width: int = Field(96, ge=4, multiple_of=4, description="channels of the parts' tokens")
+    blocks: int = Field(3, ge=1, description="layers of attention between the parts")
+
+    @field_validator("joints")
+    @classmethod
+    def _is_a_tree(cls, joints: dict[str, str | None]) -> dict[str, str | None]:
+        names = list(joints)
+        for place, (name, parent) in enumerate(joints.items()):
+            if parent is not None and parent not in names[:place]:
+                raise ValueError(f"joint {name!r} comes before its parent {parent!r}, or there is none of that name")
+        if not joints:
+            raise ValueError("joints names none")
+        return joints
+
+
+PEOPLE: dict[str, str | None] = {
+    "pelvis": None,
+    "left_hip": "pelvis", "right_hip": "pelvis", "spine1": "pelvis",
+    "left_knee": "left_hip", "right_knee": "right_hip", "spine2": "spine1",
+    "left_ankle": "left_knee", "right_ankle": "right_knee", "spine3": "spine2",
+    "left_foot": "left_ankle", "right_foot": "right_ankle", "neck": "spine3",
+    "left_collar": "spine3", "right_collar": "spine3", "head": "neck",
+    "left_shoulder": "left_collar", "right_shoulder": "right_collar",
+    "left_elbow": "left_shoulder", "right_elbow": "right_shoulder",
+    "left_wrist": "left_elbow", "right_wrist": "right_elbow",
+    "left_hand": "left_wrist", "right_hand": "right_wrist",
+}  # fmt: skip
+"""SMPL's joints and their parents."""
+
+NETWORK_NAMES = ("dsffnet", "npt", "corenet3d", "parts")
 
 NetworkRecipe = Annotated[
-    Annotated[DsffnetRecipe | NptRecipe | CoreNet3dRecipe, Field(discriminator="name")],
+    Annotated[DsffnetRecipe | NptRecipe | CoreNet3dRecipe | PartsRecipe, Field(discriminator="name")],
     BeforeValidator(_with_network_name),
 ]
 """The network of a training: one class a network, told apart by ``name``."""

@@ -14,6 +14,7 @@ from training.recipes.networks import (
     DsffnetRecipe,
     NetworkRecipe,
     NptRecipe,
+    PartsRecipe,
 )
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "EvaluationRecipe",
     "NetworkRecipe",
     "NptRecipe",
+    "PartsRecipe",
     "ScheduleRecipe",
     "TrainingRecipe",
     "budget_seconds",
@@ -96,6 +98,18 @@ class AugmentationRecipe(Frozen):
     )
     source_noise: float = Field(
         0.0, ge=0, le=0.5, description="standard deviation of noise on source vertices, half the longest box edge = 1"
+    )
+    subset: int | None = Field(
+        None,
+        ge=8,
+        description="vertices of source and of target that a step takes, others each time (edges of the loss are drawn "
+        "with them); a step's time falls with them",
+    )
+    turn: float = Field(
+        0.0,
+        ge=0,
+        le=180,
+        description="degrees that source and target are turned about the vertical at most, each its own",
     )
     shuffle: bool = Field(
         False,
@@ -194,17 +208,25 @@ class TrainingRecipe(Frozen):
 
     @model_validator(mode="after")
     def _can_be_meant(self) -> "TrainingRecipe":
-        kept = self.augmentation.vertices
-        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and kept < 1:
+        kept, subset = self.augmentation.vertices, self.augmentation.subset
+        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and (kept < 1 or subset):
+            field, whole = (f"vertices {kept}", "vertices to 1") if kept < 1 else (f"subset {subset}", "subset to null")
             raise ValueError(
-                f"network.variant 'origin' pairs source and target by index, but augmentation.vertices {kept} "
-                "leaves vertices out: set augmentation.vertices to 1, or network.variant to maxpool"
+                f"network.variant 'origin' pairs source and target by index, but augmentation.{field} "
+                f"leaves vertices out: set augmentation.{whole}, or network.variant to maxpool"
             )
         if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and self.augmentation.shuffle:
             raise ValueError(
                 "network.variant 'origin' pairs source and target by index, but augmentation.shuffle is true: "
                 "set augmentation.shuffle to false, or network.variant to maxpool"
             )
+        if isinstance(self.network, PartsRecipe) and self.augmentation.subset is None:
+            raise ValueError(
+                "network 'parts' learns from subsets of the vertices: set augmentation.subset, e.g. to 256"
+            )
+        if subset and kept < 1:
+            raise ValueError("augmentation.subset and augmentation.vertices both leave vertices out: take one away")
+        self._refuse_what_parts_does_not_know()
         if self.early_stopping and self.steps and self.evaluate_every >= self.steps:
             raise ValueError(
                 f"early_stopping {self.early_stopping} goes by evaluations, but with evaluate_every "
@@ -212,6 +234,20 @@ class TrainingRecipe(Frozen):
                 "set evaluate_every lower, or early_stopping to null"
             )
         return self
+
+    def _refuse_what_parts_does_not_know(self) -> None:
+        if not isinstance(self.network, PartsRecipe):
+            return
+        if self.augmentation.subset is None:
+            raise ValueError("network 'parts' learns from subsets of vertices: set augmentation.subset, e.g. to 256")
+        unknown = {
+            "precision": self.precision not in ("float32", "float64"),
+            "compile": self.compile,
+            "augmentation.shuffle": self.augmentation.shuffle,
+        }
+        for field, is_set in unknown.items():
+            if is_set:
+                raise ValueError(f"network 'parts' knows no {field}: take it away")
 
     def require_same_learning(self, other: "TrainingRecipe", *, where: str) -> None:
         """Raise if a run that is to be resumed was trained by another recipe.

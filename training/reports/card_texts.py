@@ -66,6 +66,8 @@ NETWORKS = {
     "dsffnet": "DSFFNet (Dual-Side Feature Fusion Network)",
     "npt": "NPT (Neural Pose Transfer), a baseline",
     "corenet3d": "3D-CoreNet, a baseline",
+    "parts": "parts network, learned from the rigs of its bodies (skinning weights, joints, rotations), which the "
+    "papers' networks are not told",
 }
 
 DATASET_USE = """\
@@ -99,6 +101,7 @@ NETWORK_LIMITS = {
     "npt origin": "\n- Source and target must have equally many vertices: they are paired by number.",
     "corenet3d": "\n- Time grows with source vertices times target vertices (memory does not), and the order of "
     "target vertices matters: its generator convolves along it.",
+    "parts": "\n- It poses by one skeleton, and what bends where that has no joint stays stiff.",
 }
 
 

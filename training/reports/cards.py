@@ -107,7 +107,9 @@ def _model_facts(
 
 def _changed(recipe: TrainingRecipe) -> Table:
     """The fields that differ from the defaults, which are the paper's for DSFFNet."""
-    usual = type(recipe)(network=type(recipe.network)())
+    usual = type(recipe)().model_copy(
+        update={"network": type(recipe.network)()}
+    )  # that as a whole nobody would train by
     here, there = flatten(recipe.model_dump(mode="json")), flatten(usual.model_dump(mode="json"))
     lines = [[key, value, there.get(key, "")] for key, value in here.items() if value != there.get(key, "")]
     caption = f"Training recipe: {len(lines)} of {len(here)} fields differ from the defaults"
@@ -155,6 +157,8 @@ def _network_words(recipe: TrainingRecipe) -> str:
 
 
 def _joined(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(value)
     return "-".join(map(str, value)) if isinstance(value, list) else str(value).lower()
 
 

@@ -130,7 +130,8 @@ def recipe_command(options: argparse.Namespace) -> None:
 def _import_weights_options(made: Parser) -> None:
     from training.recipes.training import NETWORK_NAMES
 
-    made.add_argument("network", choices=NETWORK_NAMES, help="whose they are")
+    published = [name for name in NETWORK_NAMES if name != "parts"]
+    made.add_argument("network", choices=published, help="whose they are")
     made.add_argument("files", nargs="+", metavar="FILE", help="as published; of 3D-CoreNet *_net_G.pth *_net_Corr.pth")
     made.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
     made.add_argument("--variant", choices=("maxpool", "origin"), help="of npt: the script that trained it (maxpool)")

@@ -12,6 +12,7 @@ from datagen.common.resources import memory_errors
 from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.pipeline.console import print_text, server_of
+from workflows.pipeline.pretrained import PEOPLE, weights_named
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
@@ -19,7 +20,10 @@ _OWN_STORE = Path("runs/quickstart/mlflow.db")
 def _transfer_options(made: Parser) -> None:
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
     made.add_argument(
-        "--model", required=True, metavar="RUN", help="run folder, weights, or models:/NAME@ALIAS (MLflow)"
+        "--model",
+        default=PEOPLE,
+        metavar="RUN",
+        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human (default), anny-quickstart",
     )
     add_checkpoint_option(made)
     made.add_argument(
@@ -54,9 +58,9 @@ def transfer_command(options: argparse.Namespace) -> None:
     """Pose one mesh like another, or like each of a sequence.
 
     examples:
+      dsffnet transfer pose.obj person.glb -o posed.glb --picture --viewer
+      dsffnet transfer walk/ person.glb -o walking.glb --smooth 7
       dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
-      dsffnet transfer pose.obj person.glb -o posed.glb --model runs/quickstart --picture --viewer
-      dsffnet transfer walk/ person.glb -o walking.glb --model runs/quickstart --smooth 7
       dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine
     """
     from workflows.transfer.job import TransferJob
@@ -89,7 +93,7 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path]:
     if not options.model.startswith("models:/"):
         from workflows.pipeline.weights_argument import evaluated
 
-        yield evaluated(Path(options.model), options.checkpoint).weights
+        yield evaluated(weights_named(options.model), options.checkpoint).weights
         return
     from training.inference.registered_model import download_weights
 

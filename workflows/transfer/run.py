@@ -21,6 +21,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
+from training.inference.standing import Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from workflows.transfer.job import TransferJob
 
@@ -42,23 +43,42 @@ class TransferWork:
     def __init__(self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile) -> None:
         """``first`` is the source, or the first frame of a sequence."""
         self.job, self.transfer, self.first, self.target = job, transfer, first, target
-        self.axes = job.axes or (UPRIGHT, UPRIGHT)
+        self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
         self._shown: dict[int, Mesh] = {}
 
     def settle_axes(self, weights: Path) -> None:
         """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
+        if self.transfer.finds_standing:
+            self._take_as_found(weights)
+            return
         errors = self.transfer.self_errors
         ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
-        self.axes = self.job.axes or (ways[0].axes, ways[1].axes)
+        self.axes = taken = self.job.axes or (ways[0].axes, ways[1].axes)
         seen = seen_by(weights)
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
-        for (path, mesh), axes, way in zip(meshes, self.axes, ways, strict=True):
+        for (path, mesh), axes, way in zip(meshes, taken, ways, strict=True):
             both = ways[0].axes, ways[1].axes
             if self.job.axes is None and not way.is_certain:
                 warn(f"--align leaves {path} as it is: how it stands is not certain")
             for line in remarks(
                 mesh, name=str(path), axes=axes, way=way, both=both, stated=self.job.is_told, seen=seen
             ):
+                warn(line)
+
+    def _take_as_found(self, weights: Path) -> None:
+        """Turn the meshes as a person says they stand, or the network finds; warn of those that it does not know."""
+        find = self.transfer.standing
+        told = self.job.axes if self.job.is_told else None
+        first, target = self.first.vertices, self.target.mesh.vertices
+        self.axes = told or (find([first]), find([target]))
+        misfits = [
+            self.transfer.misfit(axes.turned(each)) for axes, each in zip(self.axes, (first, target), strict=True)
+        ]
+        meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
+        seen = seen_by(weights)
+        for (path, mesh), axes, misfit in zip(meshes, self.axes, misfits, strict=True):
+            standing = Standing(axes.matrix, misfit)
+            for line in remarks(mesh, name=str(path), axes=standing, way=None, both=None, stated=bool(told), seen=seen):
                 warn(line)
 
     def run(self) -> str:
@@ -153,7 +173,7 @@ class TransferWork:
             write_page(rows, job.beside(".html"))
 
 
-def _upright(mesh: Mesh, axes: Axes, path: Path) -> "NamedMesh":
+def _upright(mesh: Mesh, axes: Axes | Standing, path: Path) -> "NamedMesh":
     from training.viz.transfer_picture import (
         NamedMesh,  # it brings matplotlib, which a transfer does not need otherwise
     )

@@ -5,12 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from datagen.common.errors import DatasetError
 from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import MIXED_COUNTS, mixed_dataset, tiny_training
+from tests.support.recipes import MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation, Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
 from training.data.triples import TripleOrder
@@ -161,7 +162,7 @@ def sources(batches: Iterator[Batch]) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("ranks", "parts"), [(2, 1), (1, 4), (2, 2)])
 def test_augmentation_is_the_same_for_any_ranks_and_parts(mixed: Dataset, ranks: int, parts: int) -> None:
-    changes = {"vertices": 0.5, "source_noise": 0.1}
+    changes = {"vertices": 0.5, "source_noise": 0.1, "turn": 20}
     alone = sources(augmented(mixed, step=3, **changes))
     shared = sources(augmented(mixed, step=3, ranks=ranks, parts=parts, **changes))
     assert len(alone) == 8 and all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
@@ -180,6 +181,56 @@ def test_subsets_are_rows_of_the_source_in_its_order_and_others_each_time(mixed:
     (plain,) = augmented(mixed, step=2)
     assert batch.source_counts is not None and batch.source.shape[1] == max(batch.source_counts)
     assert torch.equal(batch.target, plain.target) and torch.equal(batch.truth, plain.truth)
+
+
+def test_a_step_takes_so_many_vertices_and_edges_between_them(mixed: Dataset) -> None:
+    (whole,), (batch,) = (augmented(mixed, step=2, subset=size) for size in (None, 20))
+    assert batch.source.shape == batch.target.shape == batch.truth.shape == (8, 20, 3)
+    assert batch.source_counts is None and batch.target_counts is None
+    assert batch.source_rows is not None and batch.target_rows is not None and isinstance(batch.edges, PackedEdges)
+    assert isinstance(whole.edges, PackedEdges)
+    for mesh in range(8):
+        source, target = batch.source_rows[mesh], batch.target_rows[mesh]
+        assert torch.equal(batch.source[mesh], whole.source[mesh, source]) and len(source.unique()) == 20
+        assert torch.equal(batch.target[mesh], whole.target[mesh, target]) and len(target.unique()) == 20
+        assert torch.equal(batch.truth[mesh], whole.truth[mesh, target])
+        own = batch.edges.part(mesh, mesh + 1, rows=20).pairs
+        known = {tuple(pair) for pair in whole.edges.part(mesh, mesh + 1, rows=whole.target.shape[1]).pairs.tolist()}
+        assert len(own) == 5 and {tuple(pair) for pair in target[own].tolist()} <= known
+    assert len({tuple(rows.tolist()) for rows in (*batch.source_rows, *batch.target_rows)}) == 16
+
+
+def test_a_mesh_of_fewer_vertices_gives_some_twice_and_the_parts_network_gets_no_edges(mixed: Dataset) -> None:
+    (batch,) = augmented(mixed, step=2, subset=40)
+    assert batch.target.shape == (8, 40, 3) and batch.source_rows is not None
+    assert all(len(rows.unique()) in MIXED_COUNTS for rows in batch.source_rows)
+    (whole,) = augmented(mixed, step=2)
+    assert isinstance(batch.edges, PackedEdges) and isinstance(whole.edges, PackedEdges)
+    assert batch.target_rows is not None
+    for mesh, rows in enumerate(batch.target_rows):
+        own = batch.edges.part(mesh, mesh + 1, rows=40).pairs
+        assert torch.equal(rows[own], whole.edges.part(mesh, mesh + 1, rows=whole.target.shape[1]).pairs)
+    plain = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
+    thinned = Augmentation(tiny_training(**PARTS))(plain, step=0, first=0)
+    assert isinstance(thinned.edges, PackedEdges) and len(thinned.edges.pairs) == 0
+
+
+def test_meshes_are_turned_about_the_vertical_and_boxed_anew(mixed: Dataset) -> None:
+    (plain,), (batch,) = (augmented(mixed, step=2, turn=turn) for turn in (0, 25))
+    angles = []
+    for role in ("source", "target", "truth"):
+        counts = (batch.source_counts if role == "source" else batch.target_counts) or ()
+        for before, after, count in zip(getattr(plain, role), getattr(batch, role), counts, strict=True):
+            low, high = after[:count].aminmax(dim=0)
+            assert (high - low).max() == pytest.approx(2, rel=1e-5) and (low + high).abs().max() < 1e-5
+            assert torch.count_nonzero(after[count:]) == 0
+            turn, _ = Rotation.align_vectors(*(each[:count] - each[:count].mean(0) for each in (after, before)))
+            x, y, z = turn.as_euler("xyz", degrees=True)
+            assert abs(x) < 0.01 and abs(z) < 0.01
+            angles.append(round(float(y), 1))
+    sources, targets, truths = np.split(np.array(angles), 3)
+    assert np.allclose(sources, truths, atol=0.11) and np.abs(angles).max() < 25.1
+    assert len(set(sources)) == 8 and np.abs(sources - targets).min() > 0.05
 
 
 def test_noise_has_its_deviation_and_changes_from_step_to_step(mixed: Dataset) -> None:

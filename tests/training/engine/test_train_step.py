@@ -12,7 +12,7 @@ import torch
 from datagen.common.errors import BudgetSpent, CheckpointError, TrainingError
 from datagen.generate import generate
 from tests.support.ranks import finish, start_ranks, train_in_turn
-from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.recipes import PARTS, tiny_dataset, tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.engine import trainer
 from training.engine.train_step import Learner
@@ -37,6 +37,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "dsffnet": {"name": "dsffnet", "encoder_widths": (8, 8, 8), "decoder_widths": (8, 8, 8)},
     "npt": {"name": "npt", "encoder_widths": (8, 8, 13)},
     "corenet3d": {"name": "corenet3d", "feature_widths": (8, 8, 16), "generator_widths": (16, 16, 8)},
+    "parts": PARTS["network"],
 }
 
 
@@ -45,12 +46,14 @@ CUTS = {
     "dsffnet in float32": ("float32", 1e-4),
     "npt": ("float64", 1e-6),
     "corenet3d": ("float64", 1e-6),
+    "parts": ("float64", 1e-6),
 }
 """Networks trained by one rank, by one in parts and by two; the tolerance of their losses."""
 
 
 def cut(name: str, **changes: Any) -> TrainingRecipe:
     given = {**TEN, "precision": CUTS[name][0], "average": 0.9, "network": NETWORKS[name.split(maxsplit=1)[0]]}
+    given |= {"augmentation": PARTS["augmentation"]} if name == "parts" else {}
     return tiny_training(**given | changes)
 
 

@@ -1,34 +1,88 @@
 """The weights that come with the project load, fit their manifest, and pose a body that they were not trained on."""
 
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from datagen.bodies import load_body
 from datagen.common.seeding import Stream, generator
-from datagen.mesh.geometry import bounding_box
+from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.poses import draw_poses
-from datagen.recipe import AnnyBody, PoseRecipe
+from datagen.recipe import AnnyBody, AnnyTopology, PoseRecipe
+from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import point_mesh_distance
+from workflows.pipeline.pretrained import weights_named
 
-PRETRAINED = Path(__file__).parents[3] / "pretrained"
+
+@dataclass(frozen=True)
+class Case:
+    """Sources [pose, n, 3] of one person, the same poses [pose, m, 3] of another, and the target: its first."""
+
+    sources: np.ndarray
+    truths: np.ndarray
+    target: Mesh
 
 
-def test_the_quickstarts_weights_bring_new_people_into_new_poses() -> None:
-    transfer = PoseTransfer.from_run(PRETRAINED / "anny-quickstart", device="cpu")
-    body = load_body(AnnyBody(topology="notoes_collapse5pc"))
+def people(topology: AnnyTopology = "notoes_collapse5pc", *, poses: int = 8) -> Case:
+    body = load_body(AnnyBody(topology=topology))
     source, target = (body.draw_identity(generator(7, Stream.IDENTITY, number), number) for number in (0, 1))
-    poses = draw_poses(PoseRecipe(seed=7), range(8))
-    sources, truths = (body.vertices(who, poses) for who in (source, target))
-    outputs = np.stack([transfer.vertices(vertices, truths[0]) for vertices in sources[1:]])
-    unchanged = np.broadcast_to(_boxed(truths[:1]), outputs.shape)
-    error, doing_nothing = (
-        float(point_mesh_distance(torch.from_numpy(np.array(found)), torch.from_numpy(_boxed(truths[1:]))).mean())
-        for found in (outputs, unchanged)
+    drawn = draw_poses(PoseRecipe(seed=7), range(poses))
+    sources, truths = (body.vertices(who, drawn) for who in (source, target))
+    return Case(sources, truths, Mesh(truths[0], body.faces(target)))
+
+
+@pytest.fixture(scope="module")
+def human() -> PoseTransfer:
+    return PoseTransfer.from_run(weights_named("human"), device="cpu")
+
+
+def pmd(outputs: np.ndarray, truths: np.ndarray) -> float:
+    pair = (torch.from_numpy(_boxed(meshes)) for meshes in (outputs, truths))
+    return float(point_mesh_distance(*pair).mean())
+
+
+@pytest.mark.parametrize(("weights", "most"), [("anny-quickstart", 0.005), ("human", 0.0006)])
+def test_new_people_are_brought_into_new_poses(weights: str, most: float) -> None:
+    transfer, case = PoseTransfer.from_run(weights_named(weights), device="cpu"), people()
+    outputs = np.stack([transfer.vertices(vertices, case.truths[0]) for vertices in case.sources[1:]])
+    unchanged = np.broadcast_to(case.truths[:1], outputs.shape)
+    error, doing_nothing = (pmd(found, case.truths[1:]) for found in (outputs, unchanged))
+    assert error < most and 8 * error < doing_nothing
+
+
+def test_a_source_may_be_turned_or_lie_and_the_target_answers_in_its_own_axes(human: PoseTransfer) -> None:
+    case, lying = people(poses=3), Rotation.from_euler("x", -90, degrees=True)
+    ways = (Rotation.identity(), Rotation.from_euler("y", 100, degrees=True), lying)
+    posed = [
+        human(source=Mesh(case.sources[2] @ way.as_matrix().T, case.target.faces), target=case.target) for way in ways
+    ]
+    for mesh in posed:
+        assert pmd(mesh.vertices[None], case.truths[2:]) < 0.0025
+    turned = Mesh(case.target.vertices @ lying.as_matrix().T, case.target.faces)
+    answer = human(source=Mesh(case.sources[2], case.target.faces), target=turned).vertices @ lying.as_matrix()
+    assert pmd(answer[None], case.truths[2:]) < 0.0025
+
+
+def test_another_sampling_of_the_source_changes_little(human: PoseTransfer) -> None:
+    coarse, fine = people(poses=5), people("notoes", poses=5)
+    assert fine.sources.shape[1] > 10 * coarse.sources.shape[1]
+    one, other = (
+        pmd(np.stack([human.vertices(mesh, coarse.truths[0]) for mesh in its.sources[1:]]), coarse.truths[1:])
+        for its in (coarse, fine)
     )
-    assert error < 0.005 and 8 * error < doing_nothing
+    assert other < 1.5 * one + 0.0001
+
+
+def test_what_is_no_person_is_said_to_be_strange(human: PoseTransfer) -> None:
+    box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), [[0, 1, 2]])
+    found = human.standing([box.vertices])
+    assert isinstance(found, Standing) and found.misfit > STRANGE
+    known = human.standing([people(poses=1).target.vertices])
+    assert isinstance(known, Standing) and known.misfit < STRANGE / 2 and np.array_equal(known.matrix, np.eye(3))
 
 
 def _boxed(meshes: np.ndarray) -> np.ndarray:

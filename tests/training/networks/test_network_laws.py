@@ -22,6 +22,8 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "dsffnet without target side": {"target_side": False},
 }
 ALL = [*FORMS, *ABLATIONS]
+WITH_EQUATIONS = [name for name in ALL if name != "parts"]
+"""Those that tests/literal holds, equation by equation."""
 DOUBLE = torch.float64
 
 
@@ -80,7 +82,7 @@ def test_output_and_every_gradient_equal_the_equations(name: str, options: dict[
 
 @torch.no_grad()
 @pytest.mark.parametrize("start", [initial, lively])
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", WITH_EQUATIONS)
 def test_float32_is_as_exact_as_the_equations_in_float32(name: str, start: Any) -> None:
     network = start(form_of(name), wide=True, **ABLATIONS.get(name, {})).eval()
     inputs = pair_of(name, torch.float32, source=300, target=200)
@@ -118,7 +120,7 @@ def test_the_targets_order_is_that_of_the_output(name: str) -> None:
     torch.testing.assert_close(moved, network(**inputs)[:, order], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", WITH_EQUATIONS)
 @pytest.mark.parametrize(("source", "target"), [(2, 7), (40, 2), (5, 60)])
 def test_few_vertices_give_what_the_equations_give(name: str, source: int, target: int) -> None:
     network, inputs = network_of(name).eval(), pair_of(name, source=source, target=target)
@@ -169,6 +171,7 @@ DEAD = {
     "corenet3d": {f"features.layers.{i}" for i in range(3)}
     | {f"features.blocks.{i}.linear{j}" for i in range(4) for j in (1, 2)},
 }
+DEAD["parts"] = {"lift", "features", "mix.0", "mix.1"}
 DEAD["npt origin"] = DEAD["npt maxpool"] | {"decoder.lift", "decoder.block1.linear1"}
 """Layers whose bias the norm after them takes away."""
 
@@ -178,7 +181,7 @@ def test_every_parameter_receives_a_gradient_and_dead_biases_receive_zero(name: 
     network = network_of(name)
     network(**pair_of(name)).square().sum().backward()
     assert [key for key, parameter in network.named_parameters() if parameter.grad is None] == []
-    dead = {key for key, parameter in network.named_parameters() if torch.count_nonzero(parameter.grad) == 0}
+    dead = {key for key, parameter in network.named_parameters() if parameter.grad.abs().max() < 1e-13}
     assert dead == {f"{layer}.bias" for layer in DEAD[form_of(name)]}
 
 
@@ -199,7 +202,10 @@ def test_under_autocast_the_result_stays_close_and_float32(name: str, start: Any
         half = network(**inputs)
     assert half.dtype == torch.float32
     error = (half - full).square().mean().sqrt() / full.std(dim=1).mean()
-    assert 0 < error < (0.02 if name == "dsffnet" else 0.03)
+    if name == "parts":  # small, and all rotations and coordinates: it takes no notice
+        assert error == 0
+    else:
+        assert 0 < error < (0.02 if name == "dsffnet" else 0.03)
 
 
 @torch.no_grad()
@@ -207,7 +213,8 @@ def test_under_autocast_the_result_stays_close_and_float32(name: str, start: Any
 def test_export_gives_the_same_output_for_other_vertex_numbers(name: str) -> None:
     network = network_of(name, torch.float32).eval()
     example, other = (pair_of(name, torch.float32, **counts) for counts in ({}, {"source": 41, "target": 17}))
-    source, target = (torch.export.Dim(f"{key}_vertices", min=2, max=10_000) for key in example)
+    least, most = (3, 1024) if name == "parts" else (2, 10_000)  # beyond that parts reads a sample of fixed size
+    source, target = (torch.export.Dim(f"{key}_vertices", min=least, max=most) for key in example)
     free = {"source": {1: target if name == PAIRING else source}, "target": {1: target}}
     exported = torch.export.export(network, (), example, dynamic_shapes=free).module()
     torch.testing.assert_close(exported(**other), network(**other), rtol=0, atol=1e-5)

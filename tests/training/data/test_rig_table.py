@@ -1,0 +1,85 @@
+"""What the parts network is told is what the dataset's rigs say, however a batch was turned and thinned."""
+
+import numpy as np
+import pytest
+import torch
+
+from datagen.common.errors import RecipeError
+from datagen.mesh.geometry import bounding_box
+from datagen.mesh.rig import world_rotations
+from datagen.store import Dataset, open_dataset
+from tests.support.recipes import LEG, PARTS, tiny_training
+from training.data.augmentation import Augmentation
+from training.data.rig_table import RigTable
+from training.data.vertex_bank import open_bank
+
+TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5]])
+
+
+@pytest.fixture
+def legs(dataset: str) -> Dataset:
+    return open_dataset(dataset)
+
+
+def table_of(legs: Dataset) -> RigTable:
+    return RigTable(legs, legs.identities("training"), LEG, device="cpu")
+
+
+@pytest.mark.parametrize("turn", [0, 25])
+@pytest.mark.parametrize("subset", [None, 24])
+def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: int, subset: int | None) -> None:
+    recipe = tiny_training(augmentation={"turn": turn, "subset": subset})
+    batch = Augmentation(recipe)(open_bank(legs, legs.identities("training")).batch(TRIPLES), step=3, first=0)
+    told = table_of(legs).posed(TRIPLES, batch)
+    assert told.posed is not None
+    world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])
+    for said, meshes, rows, own in (
+        (told.posed[0], batch.source, batch.source_rows, TRIPLES[:, :2]),
+        (told.posed[1], batch.target, batch.target_rows, TRIPLES[:, 2:]),
+    ):
+        for place, (identity, pose) in enumerate(own.tolist()):
+            rig, vertices = legs.rig(identity), legs.vertices(identity, pose)
+            assert rig is not None
+            kept = np.arange(len(vertices)) if rows is None else rows[place].numpy()
+            np.testing.assert_allclose(said.weights[place], rig.weights[kept], atol=1e-6)
+            transforms = rig.transforms(world[[pose]])[0]
+            joints = (transforms[:, :, :3] @ rig.joints[..., None])[..., 0] + transforms[:, :, 3]
+            found = said.rotations[place].double().numpy() @ np.linalg.inv(rig.rotations(world[pose]))
+            np.testing.assert_allclose(found[0], found[1], atol=2e-4)  # one turn for all parts
+            assert (abs(np.degrees(np.arctan2(found[0, 0, 2], found[0, 0, 0]))) > 0.5) == bool(turn)
+            turned = (vertices @ found[0].T).astype(np.float64)
+            box = bounding_box(turned)
+            np.testing.assert_allclose(meshes[place], box.normalise(turned)[kept], atol=1e-3)
+            np.testing.assert_allclose(said.joints[place], box.normalise(joints @ found[0].T), atol=1e-3)
+    assert torch.equal(told.posed[0].present, torch.ones(3, 2))
+
+
+def test_bodies_rest_at_their_root_in_their_own_size(legs: Dataset) -> None:
+    batch = table_of(legs).posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
+    assert batch.posed is not None
+    rest = batch.posed[1].rest
+    span = (rest.amax(1) - rest.amin(1)).amax(1)
+    torch.testing.assert_close(span, torch.full_like(span, 2.0), rtol=1e-4, atol=0)
+    assert rest[..., 1].amax(1).abs().max() < 1e-3  # the hip is the top of a leg
+    assert not torch.allclose(rest[0], rest[1], atol=1e-3)  # each identity its own
+
+
+def test_a_part_that_a_body_lacks_is_said_to_be_absent(legs: Dataset) -> None:
+    joints = {**LEG, "left_ankle": "left_knee"}
+    table = RigTable(legs, legs.identities("training"), joints, device="cpu")
+    batch = table.posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
+    assert batch.posed is not None
+    assert torch.equal(batch.posed[0].present, torch.tensor([[1.0, 1, 0]] * 3))
+
+
+def test_a_dataset_without_rigs_or_with_other_joints_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RecipeError, match=r"names 'tail', which no pose of .* turns; its joints are pelvis, "):
+        RigTable(legs, [0], {"left_hip": None, "tail": "left_hip"}, device="cpu")
+    monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
+    with pytest.raises(RecipeError, match=r"identity 0 of .* has none\. Make a dataset of a body with a skeleton"):
+        table_of(legs)
+
+
+def test_the_recipe_asks_for_a_subset() -> None:
+    with pytest.raises(ValueError, match=r"set augmentation\.subset"):
+        tiny_training(network=PARTS["network"])

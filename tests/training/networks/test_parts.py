@@ -1,0 +1,94 @@
+"""The parts network's own parts: joints, samples and their masses, misfit; what all networks keep is in the laws."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from datagen.mesh.rig import part_transforms
+from tests.support.three_networks import lively, meshes
+from training.networks import build_network
+from training.networks.layers.rigid_parts import ancestors, matrices, moved_joints, rotations_from_six
+from training.networks.layers.sampling import offsets, sample
+from training.networks.parts import Parts, boxed
+
+PARENTS = (-1, 0, 1, 0, 3)
+
+
+def test_joints_go_where_the_datasets_rigs_put_them() -> None:
+    random = np.random.default_rng(0)
+    turns, joints = Rotation.random(10, random_state=1).as_matrix().reshape(2, 5, 3, 3), random.normal(size=(2, 5, 3))
+    transforms = part_transforms(turns, joints, PARENTS)
+    expected = (transforms[..., :3] @ joints[..., None])[..., 0] + transforms[..., 3]
+    own = torch.tensor([max(parent, 0) for parent in PARENTS])
+    found = moved_joints(torch.from_numpy(joints), torch.from_numpy(turns), own, ancestors(PARENTS))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_six_numbers_make_a_rotation() -> None:
+    found = rotations_from_six(torch.randn(7, 6, dtype=torch.float64))
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=torch.float64).expand(7, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(7, dtype=torch.float64))
+    turns = torch.from_numpy(Rotation.random(4, random_state=2).as_matrix())
+    torch.testing.assert_close(rotations_from_six(turns[..., :2].mT.flatten(1)), turns)
+    assert torch.equal(matrices(torch.arange(9.0)), torch.arange(9.0).view(3, 3))
+
+
+def sphere(count: int, *, upper: float, seed: int = 0) -> torch.Tensor:
+    """Points [1, n, 3] of a ball with the surface of a person, a share of them in its upper half."""
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[:, 1] = np.abs(points[:, 1]) * np.where(random.uniform(size=count) < upper, 1, -1)
+    return 0.43 * torch.from_numpy(points).float()[None]
+
+
+@pytest.mark.parametrize("count", [1500, 20_000])
+def test_masses_are_of_the_surface_not_of_the_vertices(count: int) -> None:
+    drawn = sample(sphere(count, upper=0.8))
+    assert drawn.masses.shape[1] <= 1024
+    torch.testing.assert_close(drawn.masses.sum(1), torch.ones(1))
+    upper = drawn.masses[0, drawn.vertices[0, :, 1] > 0].sum()
+    assert abs(upper - 0.5) < 0.06  # of the vertices four in five
+
+
+def test_a_sample_holds_every_region_once() -> None:
+    vertices = sphere(20_000, upper=0.5)
+    drawn = sample(vertices)
+    kept = drawn.vertices[0][drawn.masses[0] > 0]
+    assert torch.equal(drawn.vertices[0], vertices[0, drawn.rows[0]])
+    assert len(torch.unique(kept, dim=0)) == len(kept) > 700
+    assert torch.cdist(vertices[0, ::50], kept).min(1).values.max() < 0.11
+
+
+def test_offsets_point_out_of_the_surface_however_dense_it_is() -> None:
+    for count in (600, 20_000):
+        vertices = sphere(count, upper=0.8)
+        drawn = sample(vertices)
+        outward = torch.nn.functional.cosine_similarity(offsets(vertices, drawn), vertices, dim=2)
+        assert outward.mean() > (0.8 if count == 600 else 0.95)
+
+
+def test_parts_that_are_not_turned_leave_the_mesh_in_its_box() -> None:
+    network, vertices = lively("parts"), meshes(40, seed=3)
+    assert isinstance(network, Parts)
+    still = torch.eye(3).expand(2, 4, 3, 3)
+    weights = torch.rand(2, 40, 4).softmax(2)
+    torch.testing.assert_close(
+        network.posed(vertices, weights, torch.rand(2, 4, 3), still), boxed(vertices), rtol=0, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("joints", [{"knee": "hip", "hip": None}, {}])
+def test_joints_that_are_no_tree_are_refused(joints: dict[str, str | None]) -> None:
+    with pytest.raises(ValueError, match=r"joints must name a tree|'hip' is not in"):
+        build_network("parts", joints=joints)
+
+
+def test_misfit_is_of_each_mesh_alone_and_does_not_see_the_vertices_order() -> None:
+    network, vertices = lively("parts").eval(), meshes(60, seed=4)
+    assert isinstance(network, Parts)
+    found, facing = network.understood(vertices)
+    assert found.shape == facing.shape == (2,) and (found >= 0).all()
+    torch.testing.assert_close(network.understood(vertices[1:])[0], found[1:])
+    torch.testing.assert_close(network.understood(vertices[:, torch.randperm(60)])[0], found, rtol=1e-4, atol=1e-6)

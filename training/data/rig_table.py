@@ -1,0 +1,166 @@
+"""What a dataset's rigs say of a batch: which part each vertex belongs to, and how the parts are turned.
+
+Parts are joined as the network has them: bones that one pose joint turns are one part, as the fingers of a hand are.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datagen.common.errors import RecipeError
+from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
+from datagen.store import Dataset
+from training.data.batch import Batch
+from training.data.triples import Triples
+from training.networks.execution import sent
+from training.networks.layers.rigid_parts import ancestors, matrices, moved_joints
+from training.objectives.parts import Posed
+
+_POSES = 8  # of an identity, that its body at rest is found from
+
+
+class RigTable:
+    """The rigs of some identities and the rotations of all poses, on a device.
+
+    Parameters
+    ----------
+    joints
+        Joints that turn the network's parts, each with its parent's name (:class:`training.networks.parts.Parts`).
+
+    Raises
+    ------
+    RecipeError
+        An identity has no rig, or one whose joints are others.
+    DatasetError
+        The dataset is damaged.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        identities: Sequence[int],
+        joints: Mapping[str, str | None],
+        *,
+        device: torch.device | str,
+    ) -> None:
+        self._dataset, self._names = dataset, tuple(joints)
+        parents = [-1 if parent is None else self._names.index(parent) for parent in joints.values()]
+        self._parents = torch.tensor([part if own < 0 else own for part, own in enumerate(parents)], device=device)
+        self._above = ancestors(parents).to(device)
+        self._poses: tuple[str, ...] = tuple(dataset.attributes["joints"])
+        unknown = sorted(set(self._names) - set(self._poses))
+        if unknown:
+            raise RecipeError(
+                f"training.network.joints names {unknown[0]!r}, which no pose of {dataset.url} turns; its joints are "
+                f"{', '.join(self._poses)}. Name those that the bodies have: --set training.network.joints=..."
+            )
+        world = world_rotations(dataset.rotations(), dataset.attributes["joint_parents"])
+        chosen = [self._poses.index(name) for name in self._names]
+        self._turns = world
+        self._world = torch.from_numpy(world[:, chosen].astype(np.float32)).to(device)
+        self._device, self._row = torch.device(device), dict[int, int]()
+        weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
+        kinds, known = list[int](), dict[bytes, int]()
+        for identity in identities:
+            its_weights, its_rest, its_joints = self._of_identity(int(identity))
+            kind = known.setdefault(its_weights.tobytes(), len(known))
+            if kind == len(weights):
+                weights.append(torch.from_numpy(its_weights).to(device))
+            kinds.append(kind)
+            rest.append(torch.from_numpy(its_rest).to(device))
+            at.append(its_joints)
+            self._row[int(identity)] = len(rest) - 1
+        self._weights, self._rest, self._kinds = weights, rest, kinds
+        self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
+        self._joints = torch.from_numpy(np.stack(at)).to(device)
+
+    def posed(self, triples: Triples, batch: Batch) -> Batch:
+        """The batch of rows (source identity, source pose, target identity, target pose), with what the rigs say."""
+        sources = self._of(triples[:, 0], triples[:, 1], batch.source, batch.source_rows)
+        targets = self._of(triples[:, 2], triples[:, 3], batch.target, batch.target_rows)
+        return replace(batch, posed=(sources, targets))
+
+    def _of(
+        self, identities: NDArray[np.integer], poses: NDArray[np.integer], vertices: Tensor, rows: Tensor | None
+    ) -> Posed:
+        """How meshes of these identities and poses are posed.
+
+        Parameters
+        ----------
+        vertices
+            [b, n, 3] in each mesh' box: those that the step takes.
+        rows
+            [b, n], their numbers in the mesh; None: all.
+        """
+        own = [self._row[int(identity)] for identity in identities]
+        rows = torch.arange(vertices.shape[1]).expand(len(own), -1) if rows is None else rows
+        weights = torch.stack([self._weights[self._kinds[row]][kept] for row, kept in zip(own, rows, strict=True)])
+        rest = torch.stack([self._rest[row][kept] for row, kept in zip(own, rows, strict=True)])
+        turns = self._world.index_select(0, sent(torch.from_numpy(np.asarray(poses, np.int64)), self._device))
+        numbers = sent(torch.tensor(own), self._device)
+        joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
+        moved = moved_joints(joints, turns, self._parents, self._above)
+        shift = moved - (turns @ joints[..., None])[..., 0]
+        blended = weights @ torch.cat([turns.flatten(2), shift], dim=2)
+        posed = (matrices(blended[..., :9]) @ rest[..., None])[..., 0] + blended[..., 9:]
+        return Posed(weights, rest, *_carried(posed, vertices, turns, moved), present)
+
+    def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Weights [vertex, part] and, in the poses' rest pose and box units, vertices and joints of an identity."""
+        rig = self._dataset.rig(identity)
+        if rig is None:
+            raise RecipeError(
+                f"training.network 'parts' learns from rigs, but identity {identity} of {self._dataset.url} has none. "
+                "Make a dataset of a body with a skeleton (anny, smpl, smal, rigged), or train another network"
+            )
+        poses = self._dataset.grid.poses_of(identity)[:_POSES]
+        world = self._turns
+        posed = self._dataset.vertices(identity, poses).astype(np.float64)
+        rest = rest_vertices(posed, rig.weights, rig.transforms(world[poses]))
+        still = rig.transforms(np.broadcast_to(np.eye(3), (1, *world.shape[1:])))
+        vertices = skinned(rest, rig.weights, still)[0]
+        joints = (still[0, :, :, :3] @ rig.joints[..., None])[..., 0] + still[0, :, :, 3]
+        owner = self._owners(rig)
+        weights = np.zeros((len(rig.weights), len(self._names)), np.float32)
+        np.add.at(weights.T, owner, rig.weights.T)
+        at = np.stack([self._place(part, owner, joints, rig) for part in range(len(self._names))])
+        half = (vertices.max(axis=0) - vertices.min(axis=0)).max() / 2
+        root = at[0]
+        return weights, ((vertices - root) / half).astype(np.float32), ((at - root) / half).astype(np.float32)
+
+    def _owners(self, rig: Rig) -> NDArray[np.int64]:
+        """The network's part [part] that each part of a rig belongs to: its joint's, or that of the part above it."""
+        known = {self._poses.index(name): part for part, name in enumerate(self._names)}
+        owners = list[int]()
+        for driver, parent in zip(rig.drivers, rig.parents, strict=True):
+            owners.append(known.get(driver, owners[parent] if parent >= 0 else 0))
+        return np.array(owners)
+
+    def _place(self, part: int, owner: NDArray[np.int64], joints: NDArray[np.float64], rig: Rig) -> NDArray[np.float64]:
+        """Where the joint [3] of a part rests; of one that the body lacks, where that above it does."""
+        drivers = np.array([self._poses[driver] if driver >= 0 else "" for driver in rig.drivers])
+        while part != int(self._parents[part]) and not (drivers == self._names[part]).any():
+            part = int(self._parents[part])
+        own = joints[drivers == self._names[part]]
+        return (own if len(own) else joints[:1]).mean(axis=0)
+
+
+def _carried(posed: Tensor, vertices: Tensor, turns: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations and joints in the axes and the box of vertices [b, n, 3], which are those posed [b, n, 3] elsewhere.
+
+    The two differ by a turn about the vertical, a scale and a shift, which are found from the vertices themselves.
+    """
+    middle, there = posed.mean(dim=1, keepdim=True), vertices.mean(dim=1, keepdim=True)
+    one, other = posed - middle, vertices - there
+    crossed = one.mT @ other
+    cosine, sine = crossed[:, 0, 0] + crossed[:, 2, 2], crossed[:, 2, 0] - crossed[:, 0, 2]
+    size = torch.sqrt(cosine.square() + sine.square()).clamp_min(1e-12)
+    cosine, sine, zero = cosine / size, sine / size, torch.zeros_like(size)
+    turn = matrices(torch.stack([cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine], dim=1))
+    scale = ((one @ turn.mT) * other).sum((1, 2)) / one.square().sum((1, 2)).clamp_min(1e-12)
+    moved = (joints - middle) @ turn.mT * scale[:, None, None] + there
+    return turn[:, None] @ turns, moved

@@ -1,0 +1,157 @@
+"""How a body stands, found by a network that says how well it understands one (`Parts.understood`).
+
+Unlike :mod:`training.inference.orientation`, which asks of any network whether a mesh comes back from it, this finds
+turns between the axes as well, so that it is done without being asked for.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datagen.common.arrays import Floats
+from datagen.mesh.geometry import bounding_box
+from training.networks.parts import Parts
+
+Understanding = Callable[[Floats], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""Meshes [b, n, 3] in the normalised box -> how badly [b] each is understood (misfit), and the angle [b] about the
+vertical, in radians from +Z to +X, that it faces by."""
+
+
+def understanding_of(network: Parts) -> Understanding:
+    """Return what a network understands of meshes, a few at a time, where it is."""
+    device = next(network.parameters()).device
+
+    def understand(meshes: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        parts = torch.split(torch.from_numpy(np.ascontiguousarray(meshes, np.float32)), _MESHES_AT_ONCE)
+        found = [network.understood(part.to(device)) for part in parts]
+        misfits, facings = (torch.cat(each).double().cpu().numpy() for each in zip(*found, strict=True))
+        return misfits, facings
+
+    return understand
+
+
+STRANGE = 0.01
+"""Misfit above which a mesh is no body that the network knows, however it is turned."""
+_KNOWN = 0.003  # misfit up to which a mesh stands upright
+_STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
+_CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
+_MESHES_AT_ONCE = 16
+_LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
+_QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
+_TURNS = 3
+_TILTS = np.radians([16.0, 8.0, 4.0, 0.0])  # about any axis, tried after the best of all ways is known
+_ANGLES = np.radians(np.arange(0.0, 360.0, 30.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A turn from a mesh' own axes to those of training (Y up, facing +Z), and what misfit is left then.
+
+    Attributes
+    ----------
+    matrix
+        [3, 3].
+    misfit
+        In the normalised box.
+    """
+
+    matrix: NDArray[np.float64]
+    misfit: float
+
+    def turned(self, vertices: Floats) -> Floats:
+        """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z."""
+        return vertices @ self.matrix.T
+
+    def restored(self, vertices: Floats) -> Floats:
+        """Vertices [..., 3], Y up and facing +Z -> the mesh' own axes."""
+        return vertices @ self.matrix
+
+
+def standing(understand: Understanding, meshes: Sequence[Floats]) -> Standing:
+    """Find how a mesh stands, or several that stand alike (frames of a sequence).
+
+    A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
+    angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
+    the best. Another way is taken where it is clearly better understood.
+
+    Parameters
+    ----------
+    meshes
+        Vertices [n, 3] in any unit; 256 of each are looked at.
+    """
+
+    probes = [_probe(mesh) for mesh in meshes]
+
+    def seen(ways: Sequence[NDArray[np.float64]]) -> list[_Seen]:
+        each = [understand(np.stack([_boxed(probe @ way.T) for way in ways])) for probe in probes]
+        misfits = np.mean([misfit for misfit, _ in each], axis=0)
+        facings = np.angle(np.mean([np.exp(1j * facing) for _, facing in each], axis=0))
+        return [_Seen(way, float(m), float(f)) for way, m, f in zip(ways, misfits, facings, strict=True)]
+
+    def faced(found: _Seen) -> Standing:
+        """The way turned about the vertical until the body faces +Z, as far as the network can say."""
+        for _ in range(_TURNS):
+            found = seen([_about_vertical(-found.facing) @ found.way])[0]
+        return Standing(found.way, found.misfit)
+
+    as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
+    if as_it_is.misfit <= min(_KNOWN, *(_CLEARLY * other.misfit for other in others)):
+        return faced(as_it_is) if abs(as_it_is.facing) > _STRAIGHT else Standing(np.eye(3), as_it_is.misfit)
+    best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
+    if best.misfit <= _KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
+        return faced(best)
+    ways = [_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES]
+    for size in _TILTS:
+        best = min(seen(ways), key=lambda way: way.misfit)
+        ways = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)] + [best.way]
+    found = faced(best)
+    return found if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
+
+
+def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the turn about the vertical [3, 3] by which a body with Y up faces: ``before`` but for a clear change."""
+    angle = float(understand(_boxed(_probe(vertices) @ before)[None])[1][0])
+    return _about_vertical(angle) @ before if abs(angle) > _STRAIGHT else before
+
+
+def misfit(understand: Understanding, vertices: Floats) -> float:
+    """Return how badly a mesh [n, 3] is understood as it stands."""
+    return float(understand(_boxed(_probe(vertices))[None])[0][0])
+
+
+class _Seen(NamedTuple):
+    """A way to turn a mesh [3, 3], and how it is understood then."""
+
+    way: NDArray[np.float64]
+    misfit: float
+    facing: float
+
+
+def _upward() -> list[NDArray[np.float64]]:
+    """The least turns [3, 3] that bring each of 26 directions upward: along the axes, and midway between them."""
+    directions = [np.array(signs) for signs in product((0.0, 1.0, -1.0), repeat=3) if any(signs)]
+    return [Rotation.align_vectors([[0, 1, 0]], [each])[0].as_matrix() for each in directions]
+
+
+def _about_vertical(angle: float) -> NDArray[np.float64]:
+    return _turn(np.array([0.0, 1.0, 0.0]), angle)
+
+
+def _turn(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    return Rotation.from_rotvec(angle * axis).as_matrix()
+
+
+def _probe(mesh: Floats) -> Floats:
+    """Some vertices, the same each time, whatever lies first in the file."""
+    return mesh[np.random.default_rng(0).permutation(len(mesh))[:_LOOKED_AT]]
+
+
+def _boxed(probe: Floats) -> Floats:
+    """Some of the vertices in the box of all."""
+    return bounding_box(probe).normalise(probe)[:_VERTICES]

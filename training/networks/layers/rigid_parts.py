@@ -1,0 +1,47 @@
+"""Rigid parts: rotations from what a network says of them, and where joints go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+def rotations_from_six(numbers: Tensor) -> Tensor:
+    """Return rotations [..., 3, 3] whose first two columns are [..., 6] made orthonormal (Zhou et al. 2019)."""
+    first = normalize(numbers[..., :3], dim=-1)
+    second = numbers[..., 3:] - (first * numbers[..., 3:]).sum(dim=-1, keepdim=True) * first
+    second = normalize(second, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+
+
+def matrices(numbers: Tensor) -> Tensor:
+    """Return matrices [..., 3, 3] of their rows one after another [..., 9]."""
+    return numbers.reshape(*numbers.shape[:-1], 3, 3)
+
+
+def ancestors(parents: Sequence[int]) -> Tensor:
+    """Return [part, part] float32: 1 where the second is the first or above it; a root's parent is -1."""
+    above = torch.eye(len(parents))
+    for part, parent in enumerate(parents):
+        if parent >= 0:
+            above[part] += above[parent]
+    return above
+
+
+def moved_joints(joints: Tensor, rotations: Tensor, parents: Tensor, above: Tensor) -> Tensor:
+    """Return where joints [b, part, 3] go when every part is turned [b, part, 3, 3] about its own; roots stay.
+
+    Parameters
+    ----------
+    parents
+        [part] int64, a root's is itself.
+    above
+        :func:`ancestors`.
+    """
+    bones = joints - joints[:, parents]
+    turned = (rotations[:, parents] @ bones[..., None])[..., 0]
+    is_root = parents == torch.arange(len(parents), device=parents.device)
+    return above.to(joints.dtype) @ torch.where(is_root[:, None], joints, turned)

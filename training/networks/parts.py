@@ -1,0 +1,298 @@
+"""The parts network: it reads off a mesh which part each vertex belongs to and how the parts are turned.
+
+Unlike the networks of the papers it moves no vertex by itself. Both meshes are read by the same weights: skinning
+weights of every vertex, rotations and joints of the parts, and where each vertex lies on the body at rest. Then the
+target's parts are turned as the source's are, its skeleton takes its joints along, and its vertices follow by linear
+blend skinning. That is learned from what the papers' networks are not told: weights, joints and rotations of bodies
+that have a rig (:mod:`training.objectives.parts`).
+
+    read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
+
+No scale is taken from the source, so that missing vertices of it do not matter to the size of the output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from training.networks.layers.input_checks import check_pair
+from training.networks.layers.modulation import full_precision
+from training.networks.layers.rigid_parts import (
+    ancestors,
+    matrices,
+    moved_joints,
+    rotations_from_six,
+)
+from training.networks.layers.sampling import Sample, offsets, sample, taken, with_masses
+from training.recipes.networks import PEOPLE
+
+_VARIANCE_FLOOR = 1e-5
+_SHARPNESS = 2.0
+"""Power of the weights that vertices are posed by: the network's smear over its doubts."""
+_CORRECTIONS = 2
+"""Of the rotations, after the output was read in its turn; one that is no better is not taken."""
+
+
+class Reading(NamedTuple):
+    """What the network reads off meshes.
+
+    Attributes
+    ----------
+    logits
+        Of the part of each vertex [b, n, part].
+    rest
+        Where each vertex lies on the body at rest [b, n, 3]: from the root joint, half the box' longest edge being 1.
+    rotations, joints
+        Of the parts, [b, part, 3, 3] relative to rest and [b, part, 3], in the mesh' own axes and box.
+    """
+
+    logits: Tensor
+    rest: Tensor
+    rotations: Tensor
+    joints: Tensor
+
+
+class Parts(nn.Module):
+    """The parts network.
+
+    Parameters
+    ----------
+    joints
+        Names of the joints that turn the parts, each with its parent's; a root has none. A parent comes first.
+    width
+        Channels of the vertices' features.
+    token_width
+        Channels of the parts' tokens, a multiple of 4.
+    blocks
+        Layers of attention between the parts.
+
+    Examples
+    --------
+    >>> network = Parts(joints={"pelvis": None, "head": "pelvis"}, width=8, token_width=8, blocks=1)
+    >>> network(source=torch.rand(2, 50, 3), target=torch.rand(2, 30, 3)).shape
+    torch.Size([2, 30, 3])
+    """
+
+    parents: Tensor
+    above: Tensor
+    upright: Tensor
+
+    def __init__(
+        self, *, joints: Mapping[str, str | None] = PEOPLE, width: int = 128, token_width: int = 96, blocks: int = 3
+    ) -> None:
+        super().__init__()
+        self.joints = tuple(joints)
+        parents = [-1 if parent is None else self.joints.index(parent) for parent in joints.values()]
+        if not joints or any(parent >= part for part, parent in enumerate(parents)):
+            raise ValueError(f"joints must name a tree, each parent before its children, got {dict(joints)}")
+        if token_width % _HEADS:
+            raise ValueError(f"token_width must be a multiple of {_HEADS}, got {token_width}")
+        own = [part if parent < 0 else parent for part, parent in enumerate(parents)]
+        self.register_buffer("parents", torch.tensor(own), persistent=False)
+        self.register_buffer("above", ancestors(parents), persistent=False)
+        self.register_buffer("upright", torch.tensor([1.0, 0, 0, 0, 1, 0]), persistent=False)
+        self.lift = nn.Linear(6, 64)
+        self.features = nn.Linear(64, width)
+        self.whole = nn.Linear(width, 2 * width)
+        self.from_whole = nn.Linear(2 * width, width)
+        self.mix = nn.ModuleList(nn.Linear(width, width) for _ in range(2))
+        self.part = nn.Linear(width, len(parents))
+        self.rest = nn.Linear(width, 3)
+        self.pooled = nn.Linear(width, _POOLED)
+        self.token = nn.Linear(_POOLED + _MOMENTS, token_width)
+        self.embedding = nn.Parameter(torch.randn(len(parents), token_width) * 0.02)
+        self.blocks = nn.ModuleList(Attention(token_width) for _ in range(blocks))
+        self.norm = nn.LayerNorm(token_width)
+        self.out = nn.Linear(token_width, 9)
+        with torch.no_grad():
+            self.out.weight *= 0.1
+
+    def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
+
+        Outside of training mode weights are sharpened, and the output is read in its turn: errors in reading that
+        source and output share, being in one pose, cancel in the correction.
+
+        Raises
+        ------
+        ValueError
+            Shapes or types do not fit (:func:`training.networks.layers.input_checks.check_pair`).
+        """
+        check_pair(source, target, self.lift.weight.dtype)
+        with full_precision(source):
+            if self.training:
+                return self.posed_like(target, self.read_pair(source, target))
+            return self._corrected(source, target)
+
+    def read(self, vertices: Tensor, drawn: Sample) -> Reading:
+        """Return what is read off vertices [b, n, 3], among which a sample was drawn, in training mode or not."""
+        features = self._features(vertices, drawn)
+        logits, rest = self.part(features), self.rest(features)
+        turns, joints = self._pose(vertices, drawn, features, logits, rest)
+        return Reading(logits, rest, turns, joints)
+
+    @torch.no_grad()
+    def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how badly meshes [b, n, 3] are understood, and which way they face.
+
+        Returns
+        -------
+        tuple
+            The misfit [b]: what is left where each part is its rest, turned; a mean of squares over the surface, in the
+            mesh' box. A mesh that stands as in training leaves little, one that lies on its side or is no body of the
+            kind that was learned leaves much. And the angle [b] of the root's turn about the vertical, in radians from
+            +Z to +X.
+        """
+        with full_precision(vertices):
+            drawn = sample(vertices)
+            reading = self.read(drawn.vertices, drawn)
+            its = _moments(reading, drawn)
+            fits = (reading.rotations * its.crossed).sum((2, 3))
+            fit, rest, all_of_it = ((its.mass * each).sum(1) for each in (fits, its.squares_at_rest, its.squares))
+            misfit = all_of_it - fit.clamp_min(0).square() / rest.clamp_min(1e-12)
+            root = reading.rotations[:, 0]
+            facing = torch.atan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2])
+            return misfit / its.mass.sum(1).clamp_min(1e-12), facing
+
+    def read_pair(self, source: Tensor, target: Tensor) -> tuple[Reading, Reading]:
+        """Return the readings of all vertices of both [b, n, 3], together where they are equally many."""
+        if source.shape != target.shape:
+            return self.read(source, sample(source)), self.read(target, sample(target))
+        both = torch.cat([source, target])
+        halves = [each.chunk(2) for each in self.read(both, sample(both))]
+        return Reading._make(first for first, _ in halves), Reading._make(second for _, second in halves)
+
+    def posed_like(self, target: Tensor, readings: tuple[Reading, Reading]) -> Tensor:
+        """Return the target's vertices in the source's pose, by rotations as they were read; gradients reach both."""
+        wanted, own = readings
+        return self.posed(target, own.logits.softmax(2), own.joints, wanted.rotations @ own.rotations.mT)
+
+    def posed(self, vertices: Tensor, weights: Tensor, joints: Tensor, turns: Tensor) -> Tensor:
+        """Return vertices [b, n, 3] in a box of their own, the parts being turned [b, part, 3, 3] about the joints."""
+        moved = moved_joints(joints, turns, self.parents, self.above)
+        shift = moved - (turns @ joints[..., None])[..., 0]
+        blended = weights @ torch.cat([turns.flatten(2), shift], dim=2)
+        turned = (matrices(blended[..., :9]) @ vertices[..., None])[..., 0]
+        return boxed(turned + blended[..., 9:])
+
+    def _corrected(self, source: Tensor, target: Tensor) -> Tensor:
+        drawn = sample(source)
+        wanted = self.read(drawn.vertices, drawn).rotations
+        drawn = sample(target)
+        own = self.read(target, drawn)
+        weights = (_SHARPNESS * own.logits).softmax(2)
+        turns = wanted @ own.rotations.mT
+        best = output = self.posed(target, weights, own.joints, turns)
+        least = torch.full_like(best[:, 0, 0], torch.inf)
+        for correction in range(_CORRECTIONS + 1):
+            again = with_masses(drawn.rows, taken(output, drawn.rows), drawn.masses > 0)
+            found = self.read(again.vertices, again).rotations
+            missing = (wanted - found).square().sum((1, 2, 3))
+            best = torch.where((missing <= least)[:, None, None], output, best)
+            least = torch.minimum(least, missing)
+            if correction < _CORRECTIONS:
+                turns = wanted @ found.mT @ turns
+                output = self.posed(target, weights, own.joints, turns)
+        return best
+
+    def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
+        """Features [b, n, width] of vertices; norms and maximum are over the sample."""
+
+        def normed(layer: nn.Module, inputs: tuple[Tensor, ...], shift: Tensor | float = 0) -> tuple[Tensor, ...]:
+            outputs = [layer(each) for each in inputs]
+            mean = drawn.masses[:, None] @ outputs[-1]
+            variance = (drawn.masses[:, None] @ outputs[-1].square() - mean.square()).clamp_min(0)
+            scale = torch.rsqrt(variance + _VARIANCE_FLOOR)
+            return tuple(torch.relu((each - mean) * scale + shift) for each in outputs)
+
+        everywhere = torch.cat([vertices, offsets(vertices, drawn)], dim=2)
+        is_sample = vertices is drawn.vertices
+        inputs: tuple[Tensor, ...] = (everywhere,) if is_sample else (everywhere, taken(everywhere, drawn.rows))
+        inputs = normed(self.features, normed(self.lift, inputs))
+        whole = torch.relu(self.whole(inputs[-1])).masked_fill(drawn.masses[..., None] == 0, 0).amax(dim=1)
+        first, second = self.mix
+        return normed(second, normed(first, inputs, self.from_whole(whole)[:, None]))[0]
+
+    def _pose(
+        self, vertices: Tensor, drawn: Sample, features: Tensor, logits: Tensor, rest: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Rotations [b, part, 3, 3] and joints [b, part, 3], from what the vertices of each part have in common."""
+        pooled = self.pooled(features)
+        if vertices is not drawn.vertices:
+            pooled, logits, rest = (taken(each, drawn.rows) for each in (pooled, logits, rest))
+        at, away = drawn.vertices, offsets(drawn.vertices, drawn)
+        shares = (logits.softmax(2) * drawn.masses[..., None]).mT
+        mass = shares.sum(2, keepdim=True)
+        both = torch.cat([pooled, away, at, rest, _products(at, at), _products(at, rest)], dim=2)
+        mean = shares @ both / (mass + 1e-4)
+        pooled, middle, at_rest, squares, crossed = torch.split(mean, [_POOLED + 3, 3, 3, 9, 9], dim=2)
+        moments = [squares - _products(middle, middle), crossed - _products(middle, at_rest), 10 * mass]
+        tokens = self.token(torch.cat([pooled, middle, at_rest, *moments], dim=2)) + self.embedding
+        for block in self.blocks:
+            tokens = block(tokens)
+        found = self.out(self.norm(tokens))
+        return rotations_from_six(found[..., :6] + self.upright), middle + found[..., 6:]
+
+
+class _Moments(NamedTuple):
+    """Of the vertices of each part, sharply told apart, as they are and as they rest: masses [b, part], means
+    [b, part, 3], sums of squares about them [b, part] and products of both [b, part, 3, 3].
+    """
+
+    mass: Tensor
+    squares: Tensor
+    squares_at_rest: Tensor
+    crossed: Tensor
+
+
+def _moments(reading: Reading, drawn: Sample) -> _Moments:
+    shares = (reading.logits.softmax(2).square() * drawn.masses[..., None]).mT
+    mass = shares.sum(2, keepdim=True)
+    shares = shares / mass.clamp_min(1e-12)
+    at, rest = drawn.vertices, reading.rest
+    middle, at_rest = shares @ at, shares @ rest
+    squares, squares_at_rest = (
+        (shares @ both.square()).sum(2) - mean.square().sum(2) for both, mean in ((at, middle), (rest, at_rest))
+    )
+    crossed = matrices(shares @ _products(at, rest) - _products(middle, at_rest))
+    return _Moments(mass[..., 0], squares, squares_at_rest, crossed)
+
+
+_HEADS = 4
+_POOLED = 32
+_MOMENTS = 3 + 3 + 3 + 9 + 9 + 1
+
+
+class Attention(nn.Module):
+    """Attention between the parts' tokens, and a layer for each (Vaswani et al. 2017, norms first)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2))
+        self.asked = nn.Linear(width, 3 * width)
+        self.answer = nn.Linear(width, width)
+        self.own = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return ``[b, part, width]`` for as much."""
+        first, second = self.norms
+        query, key, value = self.asked(first(tokens)).unflatten(2, (3, _HEADS, -1)).permute(2, 0, 3, 1, 4)
+        heard = nn.functional.scaled_dot_product_attention(query, key, value)
+        tokens = tokens + self.answer(heard.transpose(1, 2).flatten(2))
+        return tokens + self.own(second(tokens))
+
+
+def boxed(vertices: Tensor) -> Tensor:
+    """Return vertices [b, n, 3] in their own box: its middle at the origin, half its longest edge one."""
+    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
+    half = ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+    return (vertices - (low + high) / 2) / half
+
+
+def _products(first: Tensor, second: Tensor) -> Tensor:
+    """Products [b, n, 9] of each coordinate of one [b, n, 3] with each of the other."""
+    return (first[..., :, None] * second[..., None, :]).flatten(2)

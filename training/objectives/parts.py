@@ -1,0 +1,86 @@
+"""What the parts network learns from: the pose given to the target, and what a rig says of both meshes.
+
+The DSFFNet paper's networks learn from vertices alone; weights, joints and rotations are supervision beyond that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import mse_loss
+
+from training.networks.layers.modulation import full_precision
+from training.networks.parts import Parts, Reading, boxed
+
+_REST, _WEIGHTS, _ROTATIONS, _JOINTS = 5.0, 0.1, 0.3, 1.0
+
+
+@dataclass(frozen=True)
+class Posed:
+    """How some meshes are posed, for the vertices that a step takes of them.
+
+    Attributes
+    ----------
+    weights
+        Skinning weights [b, n, part].
+    rest
+        Vertices [b, n, 3] in the poses' rest pose, from the root joint, half the body's longest edge being 1.
+    rotations, joints
+        Of the parts [b, part, 3, 3], relative to rest, and [b, part, 3], both in the mesh' axes, these in its box.
+    present
+        Whether the body has the part [b, part], 0 or 1: of one that it lacks nothing is to be learned.
+    """
+
+    weights: Tensor
+    rest: Tensor
+    rotations: Tensor
+    joints: Tensor
+    present: Tensor
+
+    def in_dtype(self, dtype: torch.dtype) -> Posed:
+        """The same in another floating type."""
+        return self.to(dtype)
+
+    def to(self, place: torch.dtype | torch.device | str) -> Posed:
+        """The same in another floating type, or on another device."""
+        return replace(self, **{field.name: getattr(self, field.name).to(place) for field in fields(self)})
+
+
+def parts_loss(
+    network: Parts, *, source: Tensor, target: Tensor, truth: Tensor, posed: tuple[Posed, Posed]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the weighted loss and its parts, unweighted and detached.
+
+    ``reconstruction`` is that of the papers, output and truth in boxes of the vertices that are there; the others are
+    means over both meshes: ``weights``, the cross-entropy of a vertex's part; ``rest``, ``rotation`` and ``joint``,
+    squared distances.
+
+    Parameters
+    ----------
+    source, target, truth
+        ``[b, n, 3]``.
+    posed
+        How the sources and the targets are posed.
+    """
+    with full_precision(source):
+        readings = network.read_pair(source, target)
+        output = network.posed_like(target, readings)
+    reconstruction = 3 * mse_loss(output, boxed(truth))
+    of_source, of_target = (_compared(reading, right) for reading, right in zip(readings, posed, strict=True))
+    named = {name: (value + of_target[name]) / 2 for name, value in of_source.items()}
+    loss = reconstruction + 2 * (
+        _REST * named["rest"] + _WEIGHTS * named["weights"] + _ROTATIONS * named["rotation"] + _JOINTS * named["joint"]
+    )
+    return loss, {name: value.detach() for name, value in {"reconstruction": reconstruction, **named}.items()}
+
+
+def _compared(reading: Reading, right: Posed) -> dict[str, Tensor]:
+    there = right.present / right.present.sum(1, keepdim=True)
+    return {
+        "weights": -(right.weights * reading.logits.log_softmax(2)).sum(2).mean(),
+        "rest": (reading.rest - right.rest).square().sum(2).mean(),
+        "rotation": ((reading.rotations - right.rotations).square().sum((2, 3)) * there).sum(1).mean(),
+        "joint": ((reading.joints - right.joints).square().sum(2) * there).sum(1).mean(),
+    }

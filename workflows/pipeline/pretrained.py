@@ -1,0 +1,13 @@
+"""The weights that come with the project, by name."""
+
+from pathlib import Path
+
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+PEOPLE = "human"
+"""Those that pose people, which a transfer takes where none are named."""
+
+
+def weights_named(name: str) -> Path:
+    """The path of weights that a person names: a path that is there, or the name of some that come with the project."""
+    place, own = Path(name), PRETRAINED / name
+    return own if place.name == name and not place.exists() and own.is_dir() else place
