@@ -3,10 +3,9 @@
 import os
 from typing import Any
 
-from training.engine import launch
-from training.engine import train_step as learner
+from training.engine import launch, objective
 
-_real = learner.transfer_loss
+_real = objective.transfer_loss
 _calls = 0
 
 
@@ -20,5 +19,5 @@ def _faulty(*arguments: Any, **keywords: Any) -> Any:
 
 
 if __name__ == "__main__":
-    learner.transfer_loss = _faulty
+    objective.transfer_loss = _faulty
     launch.main()

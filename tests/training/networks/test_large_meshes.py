@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.support.three_networks import FORMS, LITERAL, initial, lively, pair
+from tests.support.three_networks import LITERAL, initial, lively, pair
 
 ROOT = Path(__file__).parents[3]
 MEASURE = """
@@ -37,7 +37,7 @@ print(peak() - before)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", LITERAL)
 @pytest.mark.parametrize(("source", "target"), [(300, 30_000), (30_000, 300)])
 def test_few_and_many_vertices_give_what_the_equations_give(form: str, source: int, target: int) -> None:
     network = lively(form).double().eval()
@@ -46,7 +46,7 @@ def test_few_and_many_vertices_give_what_the_equations_give(form: str, source: i
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", LITERAL)
 @pytest.mark.parametrize("start", [initial, lively])
 def test_float32_at_thirty_thousand_vertices_is_as_exact_as_the_equations_in_float32(form: str, start) -> None:
     network, inputs = start(form).eval(), pair(form, source=500, target=30_000)
