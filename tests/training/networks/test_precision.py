@@ -107,7 +107,7 @@ def test_the_encoder_searches_in_the_active_dtype_and_returns_exact_values(dtype
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", LITERAL)
 def test_float16_autocast_errs_less_than_bfloat16(form: str) -> None:
     network, inputs = lively(form, wide=True).eval(), pair(form, source=200, target=150)
     full, error = network(**inputs), {}
@@ -132,7 +132,7 @@ def _rounded(network: nn.Module, inputs: dict[str, Tensor]) -> tuple[float, floa
     return ((found - expected).norm() / expected.norm()).item(), cosine
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", LITERAL)
 @pytest.mark.parametrize("trained", [False, True], ids=["initial", "fitted"])
 def test_gradients_under_autocast_are_those_of_float32_and_nearer_than_the_plain_equations_come(
     form: str, trained: bool
