@@ -1,5 +1,7 @@
 """What the parts network is told is what the dataset's rigs say, however a batch was turned and thinned."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -80,6 +82,17 @@ def test_a_dataset_without_rigs_or_with_other_joints_is_refused(legs: Dataset, m
         table_of(legs)
 
 
-def test_the_recipe_asks_for_a_subset() -> None:
-    with pytest.raises(ValueError, match=r"set augmentation\.subset"):
-        tiny_training(network=PARTS["network"])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"augmentation": {}}, r"set augmentation\.subset"),
+        ({"precision": "bfloat16"}, "knows no precision: take it away"),
+        ({"compile": True}, "knows no compile: take it away"),
+        ({"augmentation": {"subset": 24, "shuffle": True}}, r"knows no augmentation\.shuffle: take it away"),
+        ({"augmentation": {"subset": 24, "vertices": 0.5}}, "both leave vertices out: take one away"),
+        ({"network": {"name": "parts", "joints": {"knee": "hip"}}}, "'knee' comes before its parent 'hip'"),
+    ],
+)
+def test_recipes_that_cannot_be_meant_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tiny_training(**{**PARTS, **changes})

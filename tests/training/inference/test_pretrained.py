@@ -67,6 +67,13 @@ def test_a_source_may_be_turned_or_lie_and_the_target_answers_in_its_own_axes(hu
     assert pmd(answer[None], case.truths[2:]) < 0.0025
 
 
+def test_a_person_who_turns_round_stays_posed(human: PoseTransfer) -> None:
+    case, ways = people(poses=3), [Rotation.from_euler("y", angle, degrees=True) for angle in range(0, 200, 25)]
+    frames = [Mesh(way.apply(case.sources[2]), case.target.faces) for way in ways]
+    for way, posed in zip(ways, human.sequence(frames, case.target), strict=True):
+        assert pmd(way.inv().apply(posed.vertices)[None], case.truths[2:]) < 0.0025
+
+
 def test_another_sampling_of_the_source_changes_little(human: PoseTransfer) -> None:
     coarse, fine = people(poses=5), people("notoes", poses=5)
     assert fine.sources.shape[1] > 10 * coarse.sources.shape[1]

@@ -79,6 +79,14 @@ def test_parts_that_are_not_turned_leave_the_mesh_in_its_box() -> None:
     )
 
 
+def test_a_vertex_that_is_no_number_spoils_its_pair_even_where_the_sample_leaves_it_out() -> None:
+    network, source = lively("parts").eval(), meshes(3000, seed=5)
+    source[0, 0] = torch.nan
+    source[0, 1] = 0.001  # where the broken one is taken to be
+    output = network(source=source, target=meshes(30, seed=6))
+    assert output[0].isnan().all() and output[1].isfinite().all()
+
+
 @pytest.mark.parametrize("joints", [{"knee": "hip", "hip": None}, {}])
 def test_joints_that_are_no_tree_are_refused(joints: dict[str, str | None]) -> None:
     with pytest.raises(ValueError, match=r"joints must name a tree|'hip' is not in"):
