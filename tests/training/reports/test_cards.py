@@ -21,6 +21,7 @@ from training.recipes.training import NETWORK_NAMES, TrainingRecipe
 from training.reports.card_texts import FAMILIES, NETWORKS, POSES, family_texts
 from training.reports.cards import dataset_card, model_card
 from training.reports.report import Block, Code, Facts, Picture, Section, Table, Text
+from workflows.pipeline.pretrained import weights_named
 
 B = TypeVar("B", bound=Block)
 
@@ -102,6 +103,13 @@ def test_a_model_card_says_what_the_checkpoint_holds(workflow: tuple[Path, list[
     assert facts["parameters"].split()[0] == f"{sum(each.numel() for each in network.parameters()):,}"
     assert facts["uuid of the data"] == opened(out).uuid
     assert facts["steps"] == "8 of 4 triples each" and facts["precision"] == "float32"
+
+
+def test_a_card_of_a_network_that_learned_from_rigs_says_so(dataset: str) -> None:
+    card = model_card(weights_named("human"), open_dataset(dataset))
+    assert "learned from the rigs of its bodies" in facts_of(card)["network"]
+    assert "augmentation.subset" in {line[0] for line in all_of(card, Table)[0].lines[1:]}
+    assert "poses by one skeleton" in text_of(card)
 
 
 def test_weights_named_by_their_path_have_a_card_of_their_own(workflow: tuple[Path, list[Row]], tmp_path: Path) -> None:
