@@ -101,9 +101,9 @@ NETWORK_LIMITS = {
     "npt origin": "\n- Source and target must have equally many vertices: they are paired by number.",
     "corenet3d": "\n- Time grows with source vertices times target vertices (memory does not), and the order of "
     "target vertices matters: its generator convolves along it.",
-    "parts": "\n- It poses by one skeleton, and what bends where that has no joint stays stiff.\n- Of the above it minds "
-    "other densities least, as it reads an even sample of the vertices; and a transfer turns meshes upright first, by "
-    "how well this network understands them.",
+    "parts": "\n- It poses by one skeleton, and what bends where that has no joint stays stiff.\n"
+    "- Of the above it minds other densities least, as it reads an even sample of the vertices; and a transfer turns "
+    "meshes upright first, by how well this network understands them.",
 }
 
 
