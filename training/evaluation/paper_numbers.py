@@ -15,7 +15,7 @@ PaperData = Literal["SMPL", "SMAL"]
 
 DSFFNET, NPT, CORENET3D = "DSFFNet", "NPT", "3D-CoreNet"
 """The three networks, by the paper's names."""
-PARTS = "Parts (learned from rigs)"
+PARTS = "Parts (from rigs)"
 """No paper's: its supervision is said wherever its name is."""
 
 WITHOUT_FUSION, WITHOUT_TARGET_SIDE, WITHOUT_EDGE_LOSS = "w/o FFAdaIN", "w/o side target", "w/o L_edge"
