@@ -272,6 +272,8 @@ class TrainingRecipe(Frozen):
 
 def _meant(value: object) -> object:
     """A field's value with what its defaults stand for, so that a default may be spelled out on resume."""
+    if isinstance(value, PartsRecipe):
+        return value, list(value.joints)  # weights are in their order, which mappings do not compare
     return value.model_copy(update={"warm_up": value.rise}) if isinstance(value, ScheduleRecipe) else value
 
 

@@ -82,6 +82,15 @@ def test_a_dataset_without_rigs_or_with_other_joints_is_refused(legs: Dataset, m
         table_of(legs)
 
 
+def test_the_same_joints_in_another_order_are_another_recipe() -> None:
+    joints = {"pelvis": None, "left_hip": "pelvis", "right_hip": "pelvis"}
+    other = {"pelvis": None, "right_hip": "pelvis", "left_hip": "pelvis"}
+    one, two = (tiny_training(**PARTS | {"network": {"name": "parts", "joints": its}}) for its in (joints, other))
+    one.require_same_learning(one, where="runs/x")
+    with pytest.raises(RecipeError, match=r"training\.network"):
+        two.require_same_learning(one, where="runs/x")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
