@@ -14,7 +14,7 @@ from torch import Tensor
 _CELL = 1 / 16
 """Edge of the grid's cells, half the longest edge of a mesh' box being 1: a person meets some 900 of them."""
 _MOST = 1024
-_MOST_AT_ONCE = 8192
+_MOST_AT_ONCE = 1024
 _RADIUS = 0.1
 """Of the Gaussian that counts neighbours: about that of an arm."""
 
@@ -98,5 +98,9 @@ def _offsets(vertices: Tensor, drawn: Sample, near: Tensor) -> Tensor:
 
 def _near(vertices: Tensor, others: Tensor) -> Tensor:
     """Gaussian [b, n, k] of the distance of vertices [b, n, 3] from others [b, k, 3]."""
-    square = vertices.square().sum(2)[..., None] + others.square().sum(2)[:, None] - 2 * vertices @ others.mT
-    return torch.exp(square.clamp_min(0) * (-0.5 / _RADIUS**2))
+    one, other = vertices / _RADIUS, others / _RADIUS
+    unit = torch.ones_like(one[..., :1]), torch.ones_like(other[..., :1])
+    halves = -0.5 * one.square().sum(2, keepdim=True), -0.5 * other.square().sum(2, keepdim=True)
+    exponents = torch.cat([one, halves[0], unit[0]], dim=2) @ torch.cat([other, unit[1], halves[1]], dim=2).mT
+    # -|one - other|^2 / 2 by one product, as passes over [n, k] are what this costs; below that numbers are slow ones
+    return torch.exp(exponents.clamp_min(-60))
