@@ -14,7 +14,8 @@ from torch import Tensor
 
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
-from training.networks.layers.rigid_parts import matrices
+from training.networks.layers.rigid_parts import about_vertical
+from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
 from training.recipes.training import PartsRecipe, TrainingRecipe
 
@@ -140,9 +141,7 @@ def _turned(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Bat
     """Source and target each turned about the vertical, the truth as the source; all in their new boxes."""
     device = batch.source.device
     angles = torch.stack([torch.rand(2, generator=own, device=device) for own in random]) * 2 - 1
-    cosine, sine, zero = torch.cos(most * angles), torch.sin(most * angles), torch.zeros_like(angles)
-    rows = [cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine]
-    turns = matrices(torch.stack(rows, dim=2)).to(batch.source.dtype)
+    turns = about_vertical(torch.cos(most * angles), torch.sin(most * angles)).to(batch.source.dtype)
     source, target = turns.unbind(1)
     return replace(
         batch,
@@ -155,8 +154,7 @@ def _turned(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Bat
 def _boxed(meshes: Tensor, counts: Counts | None) -> Tensor:
     """Meshes [b, n, 3] in their own boxes; rows after a mesh' count stay zero."""
     if counts is None:
-        low, high = meshes.aminmax(dim=1, keepdim=True)
-        return (meshes - (low + high) / 2) / ((high - low) / 2).amax(dim=2, keepdim=True)
+        return boxed(meshes)
     out = torch.zeros_like(meshes)
     for row, count in enumerate(counts):
         out[row, :count] = _boxed(meshes[row : row + 1, :count], None)[0]

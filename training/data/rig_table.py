@@ -17,7 +17,8 @@ from datagen.store import Dataset
 from training.data.batch import Batch
 from training.data.triples import Triples
 from training.networks.execution import sent
-from training.networks.layers.rigid_parts import ancestors, matrices, moved_joints
+from training.networks.layers import rigid_parts
+from training.networks.layers.rigid_parts import ancestors, moved_joints
 from training.objectives.parts import Posed
 
 _POSES = 8  # of an identity, that its body at rest is found from
@@ -104,9 +105,7 @@ class RigTable:
         numbers = sent(torch.tensor(own), self._device)
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
-        shift = moved - (turns @ joints[..., None])[..., 0]
-        blended = weights @ torch.cat([turns.flatten(2), shift], dim=2)
-        posed = (matrices(blended[..., :9]) @ rest[..., None])[..., 0] + blended[..., 9:]
+        posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
         return Posed(weights, rest, *_carried(posed, vertices, turns, moved), present)
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -159,8 +158,7 @@ def _carried(posed: Tensor, vertices: Tensor, turns: Tensor, joints: Tensor) -> 
     crossed = one.mT @ other
     cosine, sine = crossed[:, 0, 0] + crossed[:, 2, 2], crossed[:, 2, 0] - crossed[:, 0, 2]
     size = torch.sqrt(cosine.square() + sine.square()).clamp_min(1e-12)
-    cosine, sine, zero = cosine / size, sine / size, torch.zeros_like(size)
-    turn = matrices(torch.stack([cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine], dim=1))
+    turn = rigid_parts.about_vertical(cosine / size, sine / size)
     scale = ((one @ turn.mT) * other).sum((1, 2)) / one.square().sum((1, 2)).clamp_min(1e-12)
     moved = (joints - middle) @ turn.mT * scale[:, None, None] + there
     return turn[:, None] @ turns, moved

@@ -73,8 +73,8 @@ class Standing:
         return vertices @ self.matrix
 
 
-def standing(understand: Understanding, meshes: Sequence[Floats]) -> Standing:
-    """Find how a mesh stands, or several that stand alike (frames of a sequence).
+def standing(understand: Understanding, mesh: Floats) -> Standing:
+    """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
@@ -82,16 +82,13 @@ def standing(understand: Understanding, meshes: Sequence[Floats]) -> Standing:
 
     Parameters
     ----------
-    meshes
-        Vertices [n, 3] in any unit; 256 of each are looked at.
+    mesh
+        Vertices [n, 3] in any unit; 256 of them are read.
     """
-
-    probes = [_probe(mesh) for mesh in meshes]
+    probe = _probe(mesh)
 
     def seen(ways: Sequence[NDArray[np.float64]]) -> list[_Seen]:
-        each = [understand(np.stack([_boxed(probe @ way.T) for way in ways])) for probe in probes]
-        misfits = np.mean([misfit for misfit, _ in each], axis=0)
-        facings = np.angle(np.mean([np.exp(1j * facing) for _, facing in each], axis=0))
+        misfits, facings = understand(np.stack([_boxed(probe @ way.T) for way in ways]))
         return [_Seen(way, float(m), float(f)) for way, m, f in zip(ways, misfits, facings, strict=True)]
 
     def faced(found: _Seen) -> Standing:

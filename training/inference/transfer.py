@@ -8,7 +8,7 @@ of the ground, so that a body that sits down sits on the ground on which it stoo
 paper's normalisation suggests, would let it float at the height of its hips.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -127,7 +127,7 @@ class PoseTransfer:
             While iterating: a mesh cannot be used.
         """
         check_mesh(target, name="target")
-        target_axes = target_axes or self.standing([target.vertices])
+        target_axes = target_axes or self.standing(target.vertices)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
         frames = self._frames(sources, upright, source_axes)
         if smooth:
@@ -170,9 +170,9 @@ class PoseTransfer:
         """Whether the network says how well it understands a mesh, so that meshes are turned without being asked."""
         return isinstance(self._network, Parts)
 
-    def standing(self, meshes: Sequence[Floats]) -> Axes | Standing:
-        """How meshes [n, 3] stand that stand alike (frames), where the network can say; else as the training data."""
-        return standing(understanding_of(self._network), meshes) if isinstance(self._network, Parts) else UPRIGHT
+    def standing(self, vertices: Floats) -> Axes | Standing:
+        """How a mesh [n, 3] stands, where the network can say; else as the training data."""
+        return standing(understanding_of(self._network), vertices) if isinstance(self._network, Parts) else UPRIGHT
 
     def misfit(self, vertices: Floats) -> float:
         """How badly a network that finds how meshes stand understands one [n, 3], Y up (`training.networks.parts`)."""
@@ -189,7 +189,7 @@ class PoseTransfer:
         turn = np.eye(3)
         for number, source in enumerate(sources):
             vertices = check_mesh(source, name=f"source {number}").vertices
-            axes = axes or self.standing([vertices])  # that of the first frame: the others may turn round
+            axes = axes or self.standing(vertices)  # that of the first frame: the others may turn round
             vertices = axes.turned(vertices)
             turn = self._turned_round(vertices, turn)
             output = self.vertices(vertices @ turn, target.vertices) @ turn.T

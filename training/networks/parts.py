@@ -26,6 +26,7 @@ from training.networks.layers.rigid_parts import (
     matrices,
     moved_joints,
     rotations_from_six,
+    skinned,
 )
 from training.networks.layers.sampling import Sample, offsets, sample, taken, with_masses
 from training.recipes.networks import PEOPLE
@@ -174,10 +175,7 @@ class Parts(nn.Module):
     def posed(self, vertices: Tensor, weights: Tensor, joints: Tensor, turns: Tensor) -> Tensor:
         """Return vertices [b, n, 3] in a box of their own, the parts being turned [b, part, 3, 3] about the joints."""
         moved = moved_joints(joints, turns, self.parents, self.above)
-        shift = moved - (turns @ joints[..., None])[..., 0]
-        blended = weights @ torch.cat([turns.flatten(2), shift], dim=2)
-        turned = (matrices(blended[..., :9]) @ vertices[..., None])[..., 0]
-        return boxed(turned + blended[..., 9:])
+        return boxed(skinned(vertices, weights, turns, joints, moved))
 
     def _corrected(self, source: Tensor, target: Tensor) -> Tensor:
         drawn = sample(source)

@@ -12,7 +12,7 @@ from datagen.common.resources import memory_errors
 from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.pipeline.console import print_text, server_of
-from workflows.pipeline.pretrained import PEOPLE, weights_named
+from workflows.pretrained import PEOPLE, weights_named
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 

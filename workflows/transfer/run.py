@@ -70,7 +70,7 @@ class TransferWork:
         find = self.transfer.standing
         told = self.job.axes if self.job.is_told else None
         first, target = self.first.vertices, self.target.mesh.vertices
-        self.axes = told or (find([first]), find([target]))
+        self.axes = told or (find(first), find(target))
         misfits = [
             self.transfer.misfit(axes.turned(each)) for axes, each in zip(self.axes, (first, target), strict=True)
         ]

@@ -15,7 +15,7 @@ from datagen.recipe import AnnyBody, AnnyTopology, PoseRecipe
 from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import point_mesh_distance
-from workflows.pipeline.pretrained import weights_named
+from workflows.pretrained import weights_named
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,9 @@ def test_another_sampling_of_the_source_changes_little(human: PoseTransfer) -> N
 
 def test_what_is_no_person_is_said_to_be_strange(human: PoseTransfer) -> None:
     box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), [[0, 1, 2]])
-    found = human.standing([box.vertices])
+    found = human.standing(box.vertices)
     assert isinstance(found, Standing) and found.misfit > STRANGE
-    known = human.standing([people(poses=1).target.vertices])
+    known = human.standing(people(poses=1).target.vertices)
     assert isinstance(known, Standing) and known.misfit < STRANGE / 2 and np.array_equal(known.matrix, np.eye(3))
 
 

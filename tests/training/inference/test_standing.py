@@ -24,15 +24,15 @@ def understand(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArr
 
 def left_over(turn: Rotation) -> float:
     """Degrees that a body turned so is from upright after it was turned as was found."""
-    found = standing(understand, [turn.apply(BODY) * 40 + 7])
+    found = standing(understand, turn.apply(BODY) * 40 + 7)
     return float(np.degrees((Rotation.from_matrix(found.matrix) * turn).magnitude()))
 
 
 def test_an_upright_body_is_left_exactly_as_it_is() -> None:
-    found = standing(understand, [BODY, BODY * 3])
+    found = standing(understand, BODY)
     assert np.array_equal(found.matrix, np.eye(3)) and found.misfit == pytest.approx(0.0005)
     slightly = Rotation.from_euler("y", 5, degrees=True).apply(BODY)
-    assert np.array_equal(standing(understand, [slightly]).matrix, np.eye(3)), "it may be an error of the network's own"
+    assert np.array_equal(standing(understand, slightly).matrix, np.eye(3)), "it may be an error of the network's own"
 
 
 @pytest.mark.parametrize("angle", [-170, -95, -30, 10, 47, 120, 180])
@@ -46,7 +46,7 @@ def test_a_body_that_lies_anyhow_is_set_upright(number: int) -> None:
 
 
 def test_what_is_understood_in_no_way_is_left_alone() -> None:
-    found = standing(lambda meshes: (np.full(len(meshes), 0.05), np.zeros(len(meshes))), [BODY])
+    found = standing(lambda meshes: (np.full(len(meshes), 0.05), np.zeros(len(meshes))), BODY)
     assert np.array_equal(found.matrix, np.eye(3)) and found.misfit == 0.05
 
 

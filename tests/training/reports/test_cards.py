@@ -21,7 +21,7 @@ from training.recipes.training import NETWORK_NAMES, TrainingRecipe
 from training.reports.card_texts import FAMILIES, NETWORKS, POSES, family_texts
 from training.reports.cards import dataset_card, model_card
 from training.reports.report import Block, Code, Facts, Picture, Section, Table, Text
-from workflows.pipeline.pretrained import weights_named
+from workflows.pretrained import weights_named
 
 B = TypeVar("B", bound=Block)
 

@@ -22,6 +22,22 @@ def matrices(numbers: Tensor) -> Tensor:
     return numbers.reshape(*numbers.shape[:-1], 3, 3)
 
 
+def about_vertical(cosine: Tensor, sine: Tensor) -> Tensor:
+    """Return rotations [..., 3, 3] about Y, from +Z to +X, by the cosines and sines [...] of their angles."""
+    zero = torch.zeros_like(cosine)
+    return matrices(torch.stack([cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine], dim=-1))
+
+
+def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, joints: Tensor, moved: Tensor) -> Tensor:
+    """Return vertices [b, n, 3] by linear blend skinning, weights [b, n, part].
+
+    Each part is turned [b, part, 3, 3] about its joint [b, part, 3], which goes to ``moved`` [b, part, 3].
+    """
+    shift = moved - (turns @ joints[..., None])[..., 0]
+    blended = weights @ torch.cat([turns.flatten(2), shift], dim=2)
+    return (matrices(blended[..., :9]) @ vertices[..., None])[..., 0] + blended[..., 9:]
+
+
 def ancestors(parents: Sequence[int]) -> Tensor:
     """Return [part, part] float32: 1 where the second is the first or above it; a root's parent is -1."""
     above = torch.eye(len(parents))
