@@ -1,11 +1,11 @@
-"""Random changes of a training batch: meshes turned about the vertical, subsets of their vertices, noisy sources.
+"""Random changes of a training batch: meshes turned, cut, thinned, noisy, and bodies of other proportions.
 
 The paper trains without. Shuffling vertices changes nothing for DSFFNet and NPT, which are invariant to the source's
 order and equivariant to the target's. The generator of 3D-CoreNet has a kernel of three along the list of the target's
 vertices: it learns from the order that a body model happens to list them in, unless they are shuffled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +14,14 @@ from torch import Tensor
 
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
+from training.data.proportions import of_other_proportions
+from training.data.triples import Triples
 from training.networks.layers.rigid_parts import about_vertical
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
-from training.recipes.training import PartsRecipe, TrainingRecipe
+from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingRecipe
+
+Supervise = Callable[[Triples, Batch], Batch]
 
 
 class Augmentation:
@@ -26,31 +30,38 @@ class Augmentation:
     So it is the same for any number of ranks and parts and from any cache. A CPU and a GPU draw different numbers.
     """
 
-    def __init__(self, recipe: TrainingRecipe) -> None:
-        self._recipe, self._seed = recipe.augmentation, recipe.seed
+    def __init__(self, recipe: TrainingRecipe, supervise: Supervise = lambda triples, batch: batch) -> None:
+        self._recipe, self._seed, self._supervise = recipe.augmentation, recipe.seed, supervise
+        self._network = recipe.network
         self._draws_edges = not isinstance(recipe.network, PartsRecipe)  # it has no edge loss
 
-    def __call__(self, batch: Batch, *, step: int, first: int) -> Batch:
-        """The batch changed: turned, then thinned, then noisy.
+    def __call__(self, triples: Triples, batch: Batch, *, step: int, first: int) -> Batch:
+        """The batch changed: turned, cut, thinned; told of its rigs; then of other proportions, and noisy.
 
         Parameters
         ----------
+        triples
+            Those of the batch.
         step
             Steps done before this one.
         first
             Place of the batch's first triple in the whole batch (:meth:`training.data.triples.TripleOrder.places`).
         """
-        recipe = self._recipe
-        if not (recipe.turn or recipe.subset or recipe.vertices < 1 or recipe.source_noise):
-            return batch
-        device = batch.source.device
+        recipe, device = self._recipe, batch.source.device
+        if recipe == AugmentationRecipe(shuffle=recipe.shuffle):
+            return self._supervise(triples, batch)
         random = [_generator(self._seed, step, first + row, device) for row in range(len(batch))]
         if recipe.turn:
             batch = _turned(batch, np.radians(recipe.turn), random)
+        if recipe.source_holes:
+            batch = _cut(batch, recipe.source_holes, random)
         if recipe.vertices < 1:
             batch = _some_of_the_source(batch, recipe.vertices, random)
         if recipe.subset:
             batch = self._subset(batch, recipe.subset, random)
+        batch = self._supervise(triples, batch)
+        if recipe.proportions and isinstance(self._network, PartsRecipe):
+            batch = of_other_proportions(batch, recipe.proportions, self._network.joints, random)
         if recipe.source_noise:
             batch = _noisy(batch, recipe.source_noise, random)
         return batch
@@ -74,7 +85,7 @@ class Augmentation:
             edges=packed,
             source_counts=None,
             target_counts=None,
-            source_rows=source,
+            source_rows=source if batch.source_rows is None else batch.source_rows.gather(1, source),
             target_rows=target,
         )
 
@@ -130,9 +141,24 @@ def _some_of_the_source(batch: Batch, fraction: float, random: Sequence[torch.Ge
     return replace(batch, source=torch.nn.utils.rnn.pad_sequence(sources, batch_first=True), source_counts=counts)
 
 
-def _noisy(batch: Batch, deviation: float, random: Sequence[torch.Generator]) -> Batch:
+def _cut(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
+    """Each source without what lies about one of its vertices, boxed by what is left."""
+    sources, rows = [], []
+    for mesh, count, own in zip(batch.source, _counts(batch), random, strict=True):
+        middle = mesh[torch.randint(count, (1,), generator=own, device=mesh.device)]
+        share = most * torch.rand((), generator=own, device=mesh.device)
+        far = (mesh[:count] - middle).square().sum(dim=1).argsort(descending=True)
+        rows.append(far[: max(1, round(count * (1 - float(share))))].sort().values)
+        sources.append(mesh[rows[-1]])
+    counts = counts_of(np.array([len(mesh) for mesh in sources]))
+    left, numbers = (torch.nn.utils.rnn.pad_sequence(each, batch_first=True) for each in (sources, rows))
+    return replace(batch, source=_boxed(left, counts), source_counts=counts, source_rows=numbers)
+
+
+def _noisy(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
     source = batch.source.clone()
     for mesh, count, own in zip(source, _counts(batch), random, strict=True):
+        deviation = most * torch.rand((), generator=own, device=mesh.device).square()
         mesh[:count] += deviation * torch.randn((count, 3), generator=own, device=mesh.device)
     return replace(batch, source=source)
 

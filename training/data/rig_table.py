@@ -106,7 +106,7 @@ class RigTable:
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
         posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
-        return Posed(weights, rest, *_carried(posed, vertices, turns, moved), present)
+        return Posed(weights, rest, joints, *_carried(posed, vertices, turns, moved), present)
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Weights [vertex, part] and, in the poses' rest pose and box units, vertices and joints of an identity."""

@@ -4,16 +4,13 @@ An objective is called as ``objective(batch, step=...)`` and returns ``{"total":
 has a gradient. It holds the network and is what is wrapped for averaging gradients over ranks.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
 from datagen.store import Dataset
-from training.data.augmentation import Shuffle
+from training.data.augmentation import Shuffle, Supervise
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
-from training.data.triples import Triples
 from training.networks.execution import autocast, compiled
 from training.networks.padded_batches import MixedCounts
 from training.networks.parts import Parts
@@ -22,7 +19,6 @@ from training.objectives.parts import parts_loss
 from training.recipes.training import PartsRecipe, TrainingRecipe
 
 Losses = dict[str, Tensor]
-Supervise = Callable[[Triples, Batch], Batch]
 
 
 class TransferObjective(nn.Module):

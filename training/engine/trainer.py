@@ -20,7 +20,7 @@ from datagen.common.errors import BudgetSpent, TrainingStopped
 from datagen.common.resources import memory_errors
 from datagen.store import open_dataset
 from training.checkpoints.checkpoint import Checkpoint, is_finished, save_checkpoint
-from training.data.augmentation import Augmentation
+from training.data.augmentation import Augmentation, Supervise
 from training.data.batch import Batch
 from training.data.cache_policy import room_of
 from training.data.triples import Triples, last_step_of
@@ -40,7 +40,7 @@ from training.engine.distributed import (
     random_state,
 )
 from training.engine.nonfinite import RecentStep, broken_step, stop_for
-from training.engine.objective import Supervise, supervision_of
+from training.engine.objective import supervision_of
 from training.engine.resume import begin, checkpoint_to_resume
 from training.engine.state import Job, State
 from training.engine.step_memory import require_step_memory
@@ -223,13 +223,10 @@ def _batches(
 ) -> Iterator[tuple[list[Triples], list[Batch]]]:
     """This rank's share of every step's triples, in parts, and their meshes on the device."""
     mine = {"rank": job.ranks.rank, "ranks": job.ranks.count, "parts": job.recipe.accumulate}
-    places, augment = job.order.places(**mine), Augmentation(job.recipe)
+    places, augment = job.order.places(**mine), Augmentation(job.recipe, supervise)
     for step, share in enumerate(bank.prefetch(job.order.batches(first_step=first_step, **mine)), first_step):
         parts = zip(share, places, strict=True)
-        yield (
-            share,
-            [supervise(triples, augment(bank.batch(triples), step=step, first=first)) for triples, first in parts],
-        )
+        yield share, [augment(triples, bank.batch(triples), step=step, first=first) for triples, first in parts]
 
 
 def _save(job: Job, state: State, observer: Observer | None, *, finished: bool, best: bool) -> None:

@@ -25,8 +25,9 @@ class Posed:
     ----------
     weights
         Skinning weights [b, n, part].
-    rest
-        Vertices [b, n, 3] in the poses' rest pose, from the root joint, half the body's longest edge being 1.
+    rest, rest_joints
+        Vertices [b, n, 3] and joints [b, part, 3] in the poses' rest pose, from the root joint, half the body's longest
+        edge being 1.
     rotations, joints
         Of the parts [b, part, 3, 3], relative to rest, and [b, part, 3], both in the mesh' axes, these in its box.
     present
@@ -35,6 +36,7 @@ class Posed:
 
     weights: Tensor
     rest: Tensor
+    rest_joints: Tensor
     rotations: Tensor
     joints: Tensor
     present: Tensor

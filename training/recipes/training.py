@@ -96,8 +96,15 @@ class AugmentationRecipe(Frozen):
     vertices: float = Field(
         1.0, gt=0, le=1, description="fraction of the source's vertices that the network sees, another subset each time"
     )
+    source_holes: float = Field(
+        0.0, ge=0, lt=1, description="largest share of the source's vertices that is cut out around one of them"
+    )
     source_noise: float = Field(
-        0.0, ge=0, le=0.5, description="standard deviation of noise on source vertices, half the longest box edge = 1"
+        0.0,
+        ge=0,
+        le=0.5,
+        description="largest standard deviation of noise on source vertices, half the longest box edge = 1; another "
+        "each time, small ones more often",
     )
     subset: int | None = Field(
         None,
@@ -110,6 +117,13 @@ class AugmentationRecipe(Frozen):
         ge=0,
         le=180,
         description="degrees that source and target are turned about the vertical at most, each its own",
+    )
+    proportions: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="network parts: standard deviation of the logarithm of the factors by which the parts of every "
+        "other triple's bodies are made larger or smaller",
     )
     shuffle: bool = Field(
         False,
@@ -142,7 +156,9 @@ class TrainingRecipe(Frozen):
     budget: Annotated[str, AfterValidator(_is_time)] | None = Field(
         None, description="time after which one command stops with a checkpoint, e.g. 10min; run it again to resume"
     )
-    optimiser: Literal["adamw", "adam"] = Field("adamw", description="AdamW, or Adam (NPT, 3D-CoreNet)")
+    optimiser: Literal["adamw", "adam", "muon"] = Field(
+        "adamw", description="AdamW, Adam (NPT, 3D-CoreNet), or Muon for the matrices and AdamW for all else"
+    )
     betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = Field(
         (0.9, 0.999), description="of the optimiser's running means"
     )
@@ -220,12 +236,13 @@ class TrainingRecipe(Frozen):
                 "network.variant 'origin' pairs source and target by index, but augmentation.shuffle is true: "
                 "set augmentation.shuffle to false, or network.variant to maxpool"
             )
-        if isinstance(self.network, PartsRecipe) and self.augmentation.subset is None:
-            raise ValueError(
-                "network 'parts' learns from subsets of the vertices: set augmentation.subset, e.g. to 256"
-            )
         if subset and kept < 1:
             raise ValueError("augmentation.subset and augmentation.vertices both leave vertices out: take one away")
+        if self.augmentation.proportions and not isinstance(self.network, PartsRecipe):
+            raise ValueError(
+                f"augmentation.proportions needs the parts that network 'parts' is told of, but the network is "
+                f"{self.network.name!r}: set augmentation.proportions to 0"
+            )
         self._refuse_what_parts_does_not_know()
         if self.early_stopping and self.steps and self.evaluate_every >= self.steps:
             raise ValueError(

@@ -149,7 +149,7 @@ def augmented(mixed: Dataset, *, step: int, ranks: int = 1, parts: int = 1, **ch
         share = {"rank": rank, "ranks": ranks, "parts": parts}
         first_places, triples = order.places(**share), next(order.batches(first_step=step, **share))
         for first, part in zip(first_places, triples, strict=True):
-            yield augment(bank.batch(part), step=step, first=first)
+            yield augment(part, bank.batch(part), step=step, first=first)
 
 
 def sources(batches: Iterator[Batch]) -> list[np.ndarray]:
@@ -162,7 +162,7 @@ def sources(batches: Iterator[Batch]) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("ranks", "parts"), [(2, 1), (1, 4), (2, 2)])
 def test_augmentation_is_the_same_for_any_ranks_and_parts(mixed: Dataset, ranks: int, parts: int) -> None:
-    changes = {"vertices": 0.5, "source_noise": 0.1, "turn": 20}
+    changes = {"vertices": 0.5, "source_noise": 0.1, "source_holes": 0.5, "turn": 20}
     alone = sources(augmented(mixed, step=3, **changes))
     shared = sources(augmented(mixed, step=3, ranks=ranks, parts=parts, **changes))
     assert len(alone) == 8 and all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
@@ -211,7 +211,7 @@ def test_a_mesh_of_fewer_vertices_gives_some_twice_and_the_parts_network_gets_no
         own = batch.edges.part(mesh, mesh + 1, rows=40).pairs
         assert torch.equal(rows[own], whole.edges.part(mesh, mesh + 1, rows=whole.target.shape[1]).pairs)
     plain = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
-    thinned = Augmentation(tiny_training(**PARTS))(plain, step=0, first=0)
+    thinned = Augmentation(tiny_training(**PARTS))(TRIPLES, plain, step=0, first=0)
     assert isinstance(thinned.edges, PackedEdges) and len(thinned.edges.pairs) == 0
 
 
@@ -233,18 +233,40 @@ def test_meshes_are_turned_about_the_vertical_and_boxed_anew(mixed: Dataset) -> 
     assert len(set(sources)) == 8 and np.abs(sources - targets).min() > 0.05
 
 
-def test_noise_has_its_deviation_and_changes_from_step_to_step(mixed: Dataset) -> None:
-    def noise(step: int) -> np.ndarray:
+def test_noise_has_another_deviation_up_to_the_largest_each_time(mixed: Dataset) -> None:
+    deviations = list[float]()
+    for step in range(8):
         plain, noisy = (sources(augmented(mixed, step=step, source_noise=amount)) for amount in (0.0, 0.2))
-        return np.concatenate(noisy) - np.concatenate(plain)
+        assert abs(np.concatenate(noisy) - np.concatenate(plain)).mean() < 0.1
+        deviations += [float((b - a).std()) for a, b in zip(plain, noisy, strict=True)]
+    assert 0.15 < max(deviations) < 0.25 and min(deviations) < 0.01 and len(set(deviations)) == len(deviations)
+    assert np.median(deviations) == pytest.approx(0.05, abs=0.03), "0.2 times the square of a uniform number"
 
-    assert noise(0).std() == pytest.approx(0.2, rel=0.15) and abs(noise(0).mean()) < 0.03
-    assert len({float(noise(step)[0, 0]) for step in range(3)}) == 3
+
+def test_a_hole_is_what_lies_about_a_vertex_and_the_rest_has_a_box_of_its_own(mixed: Dataset) -> None:
+    (plain,), (batch,) = (augmented(mixed, step=2, source_holes=share) for share in (0, 0.6))
+    assert batch.source_counts is not None and plain.source_counts is not None and batch.source_rows is not None
+    assert torch.equal(batch.target, plain.target) and torch.equal(batch.truth, plain.truth)
+    shares = list[float]()
+    for mesh, cut, rows, whole, left in zip(
+        plain.source, batch.source, batch.source_rows, plain.source_counts, batch.source_counts, strict=True
+    ):
+        kept = rows[:left]
+        gone = np.setdiff1d(np.arange(whole), kept)
+        shares.append(len(gone) / whole)
+        low, high = cut[:left].aminmax(dim=0)
+        assert (high - low).max() == pytest.approx(2, rel=1e-5) and (low + high).abs().max() < 1e-5
+        scaled = mesh[kept] - mesh[kept].aminmax(dim=0)[0]
+        torch.testing.assert_close(cut[:left] - low, scaled * (2 / scaled.max()), rtol=0, atol=1e-5)
+        inside = [float((mesh[gone] - mesh[own]).norm(dim=1).max()) for own in gone]
+        outside = [float((mesh[kept] - mesh[own]).norm(dim=1).min()) for own in gone]
+        assert not inside or any(a <= b + 1e-6 for a, b in zip(inside, outside, strict=True)), "a ball about one"
+    assert max(shares) <= 0.6 and max(shares) > 0.3 and len(set(shares)) > 4
 
 
 def test_without_augmentation_the_batch_is_left_alone(mixed: Dataset) -> None:
     batch = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
-    assert Augmentation(tiny_training())(batch, step=0, first=0) is batch
+    assert Augmentation(tiny_training())(TRIPLES, batch, step=0, first=0) is batch
 
 
 def test_a_shuffled_batch_lists_each_targets_own_vertices_in_another_order_and_back(mixed: Dataset) -> None:

@@ -31,8 +31,8 @@ def table_of(legs: Dataset) -> RigTable:
 @pytest.mark.parametrize("subset", [None, 24])
 def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: int, subset: int | None) -> None:
     recipe = tiny_training(augmentation={"turn": turn, "subset": subset})
-    batch = Augmentation(recipe)(open_bank(legs, legs.identities("training")).batch(TRIPLES), step=3, first=0)
-    told = table_of(legs).posed(TRIPLES, batch)
+    batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
+    batch = told = Augmentation(recipe, table_of(legs).posed)(TRIPLES, batch, step=3, first=0)
     assert told.posed is not None
     world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])
     for said, meshes, rows, own in (

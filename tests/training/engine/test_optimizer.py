@@ -110,7 +110,7 @@ def _begin(recipe: TrainingRecipe) -> tuple[nn.Module, torch.optim.Optimizer, Sc
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
-@pytest.mark.parametrize("optimiser", ["adamw", "adam"])
+@pytest.mark.parametrize("optimiser", ["adamw", "adam", "muon"])
 def test_stop_and_resume_is_the_same_bits_and_warns_of_nothing(schedule: dict[str, Any], optimiser: Any) -> None:
     recipe = TrainingRecipe.model_validate({"schedule": schedule, "optimiser": optimiser, "weight_decay": 0.1})
     with warnings.catch_warnings():

@@ -1,0 +1,96 @@
+"""Muon moves matrices as PyTorch's own does and everything else as AdamW, and resumes."""
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.support.recipes import tiny_training
+from training.engine.muon import Muon, orthogonal
+from training.engine.optimizer import build_optimiser, load_optimiser
+from training.recipes.training import TrainingRecipe
+
+RECIPE = tiny_training(optimiser="muon", weight_decay=0.1, learning_rate=0.01)
+
+
+def network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(40, 64), nn.Tanh(), nn.Linear(64, 64), nn.Conv1d(64, 48, 1), nn.Conv1d(48, 3, 1))
+
+
+def learn(network: nn.Module, optimiser: torch.optim.Optimizer, steps: range) -> None:
+    for step in steps:
+        optimiser.zero_grad()
+        first, second = network[:3], network[3:]  # type: ignore[index]
+        inputs = torch.randn((5, 40), generator=torch.Generator().manual_seed(step))
+        second(first(inputs)[..., None]).square().mean().backward()
+        optimiser.step()
+
+
+def of(recipe: TrainingRecipe, steps: int = 0) -> tuple[nn.Module, torch.optim.Optimizer]:
+    own = network()
+    optimiser = build_optimiser(own, recipe)
+    learn(own, optimiser, range(steps))
+    return own, optimiser
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (40, 90), (90, 40)])
+def test_steps_are_nearly_orthogonal_and_along_the_matrix_of_their_momentum(shape: tuple[int, int]) -> None:
+    random = torch.randn((3, *shape), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    left, _, right = torch.linalg.svd(random, full_matrices=False)
+    given = left @ torch.diag(torch.linspace(0.05, 1, min(shape), dtype=torch.float64)) @ right
+    along = left.mT @ orthogonal(given) @ right.mT
+    sizes = along.diagonal(dim1=1, dim2=2)
+    assert float(sizes.min()) > 0.6 and float(sizes.max()) < 1.3
+    assert float((along - torch.diag_embed(sizes)).abs().max()) < 1e-9
+
+
+def test_matrices_move_as_by_pytorchs_muon_and_all_else_as_by_adamw() -> None:
+    first, second, third = network(), network(), network()
+    matrices = [each for each in second.parameters() if each.shape in {(64, 40), (64, 64)}]
+    others = [
+        build_optimiser(first, RECIPE),
+        torch.optim.Muon(matrices, lr=0.01, weight_decay=0.1, adjust_lr_fn="match_rms_adamw"),
+        build_optimiser(third, tiny_training(weight_decay=0.1, learning_rate=0.01)),
+    ]
+    for step in range(2):
+        for own, optimiser in zip((first, second, third), others, strict=True):
+            random = torch.Generator().manual_seed(step)
+            for parameter in own.parameters():
+                parameter.grad = torch.randn(parameter.shape, generator=random)
+            optimiser.step()
+    before, moved, muon, adamw = (each.state_dict() for each in (network(), first, second, third))
+    for name in ("0.weight", "2.weight"):
+        error = float((moved[name] - muon[name]).norm() / (moved[name] - before[name]).norm())
+        assert error < 0.05, "PyTorch's is in bfloat16"
+    alike = {name for name in moved if torch.equal(moved[name], adamw[name])}
+    assert alike == {"0.bias", "2.bias", "3.bias", "4.weight", "4.bias"}
+
+
+def test_a_step_that_is_not_finite_leaves_all_as_it_is() -> None:
+    own, optimiser = of(RECIPE, steps=2)
+    before, moments = copy.deepcopy((own.state_dict(), optimiser.state_dict()["state"]))
+    for parameter in own.parameters():
+        parameter.grad = torch.full_like(parameter, torch.nan)
+    optimiser.found_inf = torch.ones(())  # type: ignore[attr-defined]
+    optimiser.step()
+    assert all(torch.equal(value, before[name]) for name, value in own.state_dict().items())
+    now = optimiser.state_dict()["state"]
+    assert all(torch.equal(now[number]["momentum"], its["momentum"]) for number, its in moments.items() if len(its) < 3)
+    assert sum("momentum" in its for its in moments.values()) == 3
+
+
+def test_it_resumes_to_the_same_bits_and_refuses_the_state_of_others() -> None:
+    whole, _ = of(RECIPE, steps=4)
+    half, optimiser = of(RECIPE, steps=2)
+    state = copy.deepcopy(optimiser.state_dict())
+    resumed = build_optimiser(half, RECIPE)
+    assert isinstance(resumed, Muon)
+    load_optimiser(resumed, state)
+    learn(half, resumed, range(2, 4))
+    found: dict[str, Tensor] = half.state_dict()
+    assert all(torch.equal(value, found[name]) for name, value in whole.state_dict().items())
+    state["state"][0] = {"step": torch.zeros(()), "momentum": torch.zeros(3)}
+    with pytest.raises(ValueError, match="that of other parameters"):
+        load_optimiser(resumed, state)

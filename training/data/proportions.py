@@ -1,0 +1,79 @@
+"""Bodies of other proportions than a dataset's, made from what its rigs say: larger heads, shorter legs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from training.data.batch import Batch
+from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
+from training.objectives.parts import Posed
+
+
+def of_other_proportions(
+    batch: Batch, deviation: float, joints: Mapping[str, str | None], random: Sequence[torch.Generator]
+) -> Batch:
+    """Every other triple with parts that are larger and smaller, left and right alike, posed by skinning.
+
+    Parameters
+    ----------
+    batch
+        Told of its rigs.
+    joints
+        Of the network, each with its parent's name.
+    """
+    assert batch.posed is not None
+    names, device = list(joints), batch.source.device
+    parents = [-1 if parent is None else names.index(parent) for parent in joints.values()]
+    tree = torch.tensor([part if own < 0 else own for part, own in enumerate(parents)], device=device)
+    above = ancestors(parents).to(device)
+    alike = torch.tensor([names.index(_left(name) if _left(name) in joints else name) for name in names], device=device)
+    drawn = torch.stack([torch.randn((2, len(names)), generator=own, device=device) for own in random])
+    chosen = torch.stack([torch.rand((), generator=own, device=device) < 0.5 for own in random])
+    sizes = torch.exp(deviation * drawn[:, :, alike]).to(batch.source.dtype)
+    bodies = [
+        _resized(posed, factors, tree, above) for posed, factors in zip(batch.posed, sizes.unbind(1), strict=True)
+    ]
+    of_source, of_target = bodies
+    source, of_source = _placed(of_source, of_source.rotations, tree, above)
+    truth, _ = _placed(of_target, of_source.rotations, tree, above)
+    target, of_target = _placed(of_target, of_target.rotations, tree, above)
+    return replace(
+        batch,
+        source=_where(chosen, source, batch.source),
+        target=_where(chosen, target, batch.target),
+        truth=_where(chosen, truth, batch.truth),
+        posed=(_either(chosen, of_source, batch.posed[0]), _either(chosen, of_target, batch.posed[1])),
+    )
+
+
+def _left(name: str) -> str:
+    return name.replace("right", "left")
+
+
+def _resized(posed: Posed, sizes: Tensor, parents: Tensor, above: Tensor) -> Posed:
+    """The body at rest with each part made larger by its own factor [b, part], and so the bones that it carries."""
+    still = sizes[:, :, None, None] * torch.eye(3, dtype=sizes.dtype, device=sizes.device)
+    joints = moved_joints(posed.rest_joints, still, parents, above)
+    rest = skinned(posed.rest, posed.weights, still, posed.rest_joints, joints)
+    half = (rest.amax(1) - rest.amin(1)).amax(1) / (posed.rest.amax(1) - posed.rest.amin(1)).amax(1)
+    return replace(posed, rest=rest / half[:, None, None], rest_joints=joints / half[:, None, None])
+
+
+def _placed(posed: Posed, rotations: Tensor, parents: Tensor, above: Tensor) -> tuple[Tensor, Posed]:
+    """The body's vertices [b, n, 3] with its parts turned so, in their box, and the same of its joints."""
+    joints = moved_joints(posed.rest_joints, rotations, parents, above)
+    vertices = skinned(posed.rest, posed.weights, rotations, posed.rest_joints, joints)
+    low, high = vertices.aminmax(dim=1, keepdim=True)
+    middle, half = (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True)
+    return (vertices - middle) / half, replace(posed, rotations=rotations, joints=(joints - middle) / half)
+
+
+def _either(chosen: Tensor, one: Posed, other: Posed) -> Posed:
+    names = [field.name for field in fields(Posed)]
+    return Posed(**{name: _where(chosen, getattr(one, name), getattr(other, name)) for name in names})
+
+
+def _where(chosen: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    return torch.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, other)
