@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
+from datagen.characters.joint_names import pairs
 from training.data.batch import Batch
 from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
 from training.objectives.parts import Posed
@@ -28,7 +29,9 @@ def of_other_proportions(
     parents = [-1 if parent is None else names.index(parent) for parent in joints.values()]
     tree = torch.tensor([part if own < 0 else own for part, own in enumerate(parents)], device=device)
     above = ancestors(parents).to(device)
-    alike = torch.tensor([names.index(_left(name) if _left(name) in joints else name) for name in names], device=device)
+    alike = torch.arange(len(names), device=device)
+    for left, right in pairs(names):
+        alike[right] = left
     drawn = torch.stack([torch.randn((2, len(names)), generator=own, device=device) for own in random])
     chosen = torch.stack([torch.rand((), generator=own, device=device) < 0.5 for own in random])
     sizes = torch.exp(deviation * drawn[:, :, alike]).to(batch.source.dtype)
@@ -46,10 +49,6 @@ def of_other_proportions(
         truth=_where(chosen, truth, batch.truth),
         posed=(_either(chosen, of_source, batch.posed[0]), _either(chosen, of_target, batch.posed[1])),
     )
-
-
-def _left(name: str) -> str:
-    return name.replace("right", "left")
 
 
 def _resized(posed: Posed, sizes: Tensor, parents: Tensor, above: Tensor) -> Posed:

@@ -12,7 +12,7 @@ from datagen.common.resources import memory_errors
 from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.pipeline.console import print_text, server_of
-from workflows.pretrained import PEOPLE, weights_named
+from workflows.pretrained import weights_named
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
@@ -21,9 +21,9 @@ def _transfer_options(made: Parser) -> None:
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
     made.add_argument(
         "--model",
-        default=PEOPLE,
         metavar="RUN",
-        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human (default), anny-quickstart",
+        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, animals, anny-quickstart "
+        "(default: human or animals, by the meshes)",
     )
     add_checkpoint_option(made)
     made.add_argument(
@@ -33,6 +33,7 @@ def _transfer_options(made: Parser) -> None:
     made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
     made.add_argument("--source-geometry", metavar="NAME", help="which of several geometries of a GLB has the pose")
     made.add_argument("--target-geometry", metavar="NAME", help="which of several geometries of a GLB is posed")
+    made.add_argument("--force", action="store_true", help="pose an animal like a person, or a person like an animal")
     _add_standing(made)
     _add_extras(made)
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
@@ -69,19 +70,19 @@ def transfer_command(options: argparse.Namespace) -> None:
     job.check_places()
     source, target = job.read_source(0), job.read_target()
     job.check_textures(source, target)
-    with weights_of(options) as weights:
-        from training.inference.transfer import PoseTransfer
+    with (
+        weights_of(options) as weights,
+        memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"),
+    ):
         from workflows.transfer.run import TransferWork
 
-        work = TransferWork(job, PoseTransfer.from_run(weights), first=source.mesh, target=target)
-        with memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"):
-            work.settle_axes(weights)
-            print_text(printable(work.run()))
+        work = TransferWork.of(job, weights, first=source.mesh, target=target, force=options.force)
+        print_text(printable(work.run()))
 
 
 @contextmanager
-def weights_of(options: argparse.Namespace) -> Iterator[Path]:
-    """The folder or file of the weights that ``--model`` names.
+def weights_of(options: argparse.Namespace) -> Iterator[Path | None]:
+    """The folder or file of the weights that ``--model`` names, None where it names none.
 
     Raises
     ------
@@ -90,6 +91,11 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path]:
     RegistryError
         MLflow does not have that model.
     """
+    if options.model is None:
+        if options.checkpoint != "result":
+            raise RecipeError("--checkpoint is one of a run's: add --model RUN")
+        yield None
+        return
     if not options.model.startswith("models:/"):
         from workflows.pipeline.weights_argument import evaluated
 

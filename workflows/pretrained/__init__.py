@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-PEOPLE = "human"
-"""Those that pose people, which a transfer takes where none are named."""
+KINDS = {"human": "a person", "animals": "an animal on four legs"}
+"""Those that a transfer chooses from where none are named, and what they pose."""
 
 
 def weights_named(name: str) -> Path:

@@ -23,6 +23,7 @@ from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
+from workflows.transfer.choice import chosen, standings
 from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
@@ -40,17 +41,41 @@ def warn(line: str) -> None:
 class TransferWork:
     """A job whose meshes are read and whose network is loaded."""
 
-    def __init__(self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile) -> None:
-        """``first`` is the source, or the first frame of a sequence."""
+    def __init__(
+        self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile, by: str = ""
+    ) -> None:
+        """``first`` is the source, or the first frame of a sequence; ``by``: weights that were chosen."""
         self.job, self.transfer, self.first, self.target = job, transfer, first, target
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
+        self._by = by
         self._shown: dict[int, Mesh] = {}
 
-    def settle_axes(self, weights: Path) -> None:
+    @classmethod
+    def of(
+        cls, job: TransferJob, weights: Path | None, *, first: Mesh, target: MeshFile, force: bool
+    ) -> "TransferWork":
+        """The job by weights, or by those of the project's own that know both meshes; how these stand is settled.
+
+        Raises
+        ------
+        MeshError
+            A person is to be posed like an animal, and it is not forced.
+        """
+        meshes = first, target.mesh
+        if weights is None:
+            found = chosen(job, meshes, force=force)
+            work = cls(job, found.transfer, first=first, target=target, by=found.weights.name)
+            work._take(found.standings, found.weights)
+            return work
+        work = cls(job, PoseTransfer.from_run(weights), first=first, target=target)
+        if work.transfer.finds_standing:
+            work._take(standings(work.transfer, job, meshes), weights)
+        else:
+            work._settle_axes(weights)
+        return work
+
+    def _settle_axes(self, weights: Path) -> None:
         """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
-        if self.transfer.finds_standing:
-            self._take_as_found(weights)
-            return
         errors = self.transfer.self_errors
         ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
         self.axes = taken = self.job.axes or (ways[0].axes, ways[1].axes)
@@ -65,20 +90,12 @@ class TransferWork:
             ):
                 warn(line)
 
-    def _take_as_found(self, weights: Path) -> None:
-        """Turn the meshes as a person says they stand, or the network finds; warn of those that it does not know."""
-        find = self.transfer.standing
-        told = self.job.axes if self.job.is_told else None
-        first, target = self.first.vertices, self.target.mesh.vertices
-        self.axes = told or (find(first), find(target))
-        misfits = [
-            self.transfer.misfit(axes.turned(each)) for axes, each in zip(self.axes, (first, target), strict=True)
-        ]
+    def _take(self, found: tuple[Standing, Standing], weights: Path) -> None:
+        """Turn the meshes as they were found to stand; warn of those that the network does not know."""
+        self.axes, seen, stated = found, seen_by(weights), self.job.is_told
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
-        seen = seen_by(weights)
-        for (path, mesh), axes, misfit in zip(meshes, self.axes, misfits, strict=True):
-            standing = Standing(axes.matrix, misfit)
-            for line in remarks(mesh, name=str(path), axes=standing, way=None, both=None, stated=bool(told), seen=seen):
+        for (path, mesh), axes in zip(meshes, found, strict=True):
+            for line in remarks(mesh, name=str(path), axes=axes, way=None, both=None, stated=stated, seen=seen):
                 warn(line)
 
     def run(self) -> str:
@@ -86,7 +103,7 @@ class TransferWork:
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
         if self.job.drawn:
             self._draw()
-        return done
+        return f"{done}, by the weights {self._by}" if self._by else done
 
     def _votes(self) -> list[NDArray[np.floating]]:
         count = len(self.job.sources)

@@ -1,0 +1,75 @@
+"""Which of the weights that come along pose two meshes: those of people, or those of animals."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.common.errors import MeshError
+from datagen.mesh.geometry import Mesh
+from training.inference.orientation import Axes
+from training.inference.standing import STRANGE, Standing
+from training.inference.transfer import PoseTransfer
+from workflows.pretrained import KINDS, weights_named
+from workflows.transfer.job import TransferJob
+
+Pair = tuple[Standing, Standing]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Weights, their network, and how source and target stand, as the network finds or a person says."""
+
+    weights: Path
+    transfer: PoseTransfer
+    standings: Pair
+
+    @classmethod
+    def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> "Chosen":
+        """The weights named so, of a network that finds how meshes stand."""
+        transfer = PoseTransfer.from_run(weights)
+        return cls(weights, transfer, standings(transfer, job, meshes))
+
+    @property
+    def knows_both(self) -> bool:
+        """Whether source and target are bodies of the kind that the network knows."""
+        return all(found.misfit <= STRANGE for found in self.standings)
+
+
+def standings(transfer: PoseTransfer, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> Pair:
+    """How source and target stand: as a person says, or as the network finds."""
+    source, target = (
+        _told(transfer, axes, mesh) if job.is_told and axes else transfer.standing(mesh.vertices)
+        for axes, mesh in zip(job.axes or (None, None), meshes, strict=True)
+    )
+    assert isinstance(source, Standing) and isinstance(target, Standing)
+    return source, target
+
+
+def _told(transfer: PoseTransfer, axes: Axes, mesh: Mesh) -> Standing:
+    return Standing(axes.matrix, transfer.misfit(axes.turned(mesh.vertices)))
+
+
+def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool) -> Chosen:
+    """Return the weights that know both meshes; of meshes that none knows, those of people.
+
+    Raises
+    ------
+    MeshError
+        One is a person and one an animal, and it is not forced.
+    """
+    people = Chosen.of(weights_named("human"), job, meshes)
+    if people.knows_both:
+        return people
+    every = {"human": people} | {name: Chosen.of(weights_named(name), job, meshes) for name in KINDS if name != "human"}
+    source, target = (_kind(every, place) for place in range(2))
+    if source and target and source != target and not force:
+        raise MeshError(
+            f"{job.sources[0]} is {KINDS[source]} and {job.target} is {KINDS[target]}: a pose of the one says nothing "
+            "of the other. Give two of a kind; or add --force, to see what comes of it"
+        )
+    return every[target or source or "human"]
+
+
+def _kind(every: dict[str, Chosen], place: int) -> str | None:
+    """The weights by which a mesh is best understood, if any understands it."""
+    misfit, name = min((each.standings[place].misfit, name) for name, each in every.items())
+    return name if misfit <= STRANGE else None
