@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.common.arrays import Floats
 from datagen.common.errors import MeshError
 
 _SMALLEST, _LARGEST = 1e-15, 1e15  # of a box and of coordinates, in any unit that a body is measured in
@@ -66,6 +67,12 @@ def bounding_box(vertices: NDArray[np.floating]) -> Box:
     """
     low, high = vertices.min(axis=-2), vertices.max(axis=-2)
     return Box((low + high) / 2, (high - low).max(axis=-1) / 2)
+
+
+def standing_point(vertices: Floats) -> NDArray[np.float64]:
+    """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
 
 
 def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datagen.common.arrays import Floats, Integers
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, standing_point
 from training.data.batch import Batch
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
 from training.viz.mesh_grid import ROLE_COLORS
 from training.viz.render.renderer import Camera, frame, render_mesh
 from training.viz.style import DPI, INK, PAGE, QUIET, saved
-from training.viz.transfer_example import standing_point
 
 COLUMNS = {"source": "Source", "target": "Target", "output": "Output", "truth": "Ground truth"}
 _PANEL, _MARGIN, _HEAD, _GAP = (230, 260), 16, 84, 10

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
+from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
 from training.inference.standing import Standing, facing, misfit, standing, understanding_of
@@ -223,12 +223,6 @@ def scale_of(target: Mesh, vertices: Floats) -> float:
     before, after = (_side_lengths(each, target.faces) for each in (target.vertices, vertices))
     usable = (after > _NO_LENGTH) & (before > 0)
     return float(np.median(before[usable] / after[usable])) if usable.any() else 1.0
-
-
-def standing_point(vertices: Floats) -> NDArray[np.float64]:
-    """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
 
 
 def placed(target: Mesh, vertices: Floats) -> Floats:

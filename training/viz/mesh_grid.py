@@ -12,12 +12,11 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 
 from datagen.common.arrays import Floats, Integers
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.page import Page
 from training.viz.render.camera import frame
 from training.viz.render.renderer import Camera, MeshLike, render_mesh
 from training.viz.style import PAGE, QUIET, ROLE_COLORS, saved
-from training.viz.transfer_example import standing_point
 
 __all__ = ["ROLE_COLORS", "contact_sheet"]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.render.camera import Camera, MeshLike, azimuth_of, frame
 
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
@@ -139,12 +139,6 @@ def _stood(mesh: Mesh, name: str, right: Mesh | None, *, moves_with: Mesh | None
     if name == "source" and right is not None:
         scale = _size(right.vertices) / max(_size(mesh.vertices), 1e-12)
     return scale * (mesh.vertices - standing_point(anchor.vertices))
-
-
-def standing_point(vertices: Floats) -> Floats:
-    """Return the point [3] under the middle of the box of vertices [v, 3]."""
-    low, high = vertices.min(0), vertices.max(0)
-    return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
 
 
 def _size(vertices: Floats) -> float:

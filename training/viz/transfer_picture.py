@@ -25,9 +25,9 @@ def shown(source: NamedMesh, target: NamedMesh, output: NamedMesh) -> Comparison
     return Comparison(title=title, source=source, target=target, outputs={"Output": output})
 
 
-def write_picture(rows: Sequence[Comparison], path: Path) -> Path:
-    """Draw transfers as a PNG, one a row; it appears whole or not at all."""
-    return comparison_figure(rows, path, panel=PANEL)
+def write_picture(rows: Sequence[Comparison], path: Path, *, panel: tuple[int, int] = PANEL) -> Path:
+    """Draw transfers as a PNG, one a row of panels [width, height] in pixels; it appears whole or not at all."""
+    return comparison_figure(rows, path, panel=panel)
 
 
 def write_page(rows: Sequence[Comparison], path: Path) -> Path:

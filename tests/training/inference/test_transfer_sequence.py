@@ -9,10 +9,10 @@ from scipy.signal import savgol_filter
 from torch import Tensor, nn
 
 from datagen.common.errors import MeshError
-from datagen.mesh.geometry import Mesh, bounding_box
+from datagen.mesh.geometry import Mesh, bounding_box, standing_point
 from training.inference.orientation import Axes
 from training.inference.smoothing import smoothed
-from training.inference.transfer import PoseTransfer, standing_point
+from training.inference.transfer import PoseTransfer
 from training.networks import build_network
 
 FACES = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])

@@ -199,7 +199,7 @@ def test_of_a_broken_frame_on_what_is_finished_stays_beside_the_output(
     transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     walk = broken_walk(tmp_path / "walk", broken=1)
-    monkeypatch.setattr(TransferWork, "settle_axes", lambda work, weights: None)  # it looks at later frames, too
+    monkeypatch.setattr(TransferWork, "_settle_axes", lambda work, weights: None)  # it looks at later frames, too
     before = files(tmp_path)
     with pytest.raises(MeshError, match=r"1\.obj"):
         transfer(walk, "person.obj", "-o", tmp_path / "walked.glb")

@@ -1,0 +1,90 @@
+"""Weights are chosen by which of them understand the meshes, and a person is not posed like an animal unasked."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datagen.common.errors import MeshError, RecipeError
+from datagen.mesh.geometry import Mesh
+from training.inference.standing import Standing
+from training.inference.transfer import PoseTransfer
+from workflows.cli import main as cli
+from workflows.transfer.choice import chosen
+from workflows.transfer.job import TransferJob
+
+FACES = np.array([[0, 1, 2]])
+PERSON, ANIMAL, BOX = (Mesh(np.eye(3) * size, FACES) for size in (1.0, 2.0, 3.0))
+MISFITS = {("human", 1): 0.0005, ("human", 2): 0.05, ("animals", 1): 0.03, ("animals", 2): 0.002}
+Choose = Callable[..., tuple[str, list[float]]]
+
+
+@dataclass(frozen=True)
+class Understanding:
+    """Stands in for the network of some weights."""
+
+    name: str
+
+    def misfit(self, vertices: np.ndarray) -> float:
+        return MISFITS.get((self.name, round(float(np.abs(vertices).max()))), 0.1)
+
+    def standing(self, vertices: np.ndarray) -> Standing:
+        return Standing(np.eye(3), self.misfit(vertices))
+
+
+@pytest.fixture
+def choose(monkeypatch: pytest.MonkeyPatch) -> Choose:
+    loaded: list[str] = []
+
+    def from_run(weights: Path) -> Understanding:
+        loaded.append(weights.name)
+        return Understanding(weights.name)
+
+    monkeypatch.setattr(PoseTransfer, "from_run", from_run)
+
+    def call(source: Mesh, target: Mesh, *, force: bool = False, is_told: bool = False) -> tuple[str, list[float]]:
+        loaded.clear()
+        job = TransferJob([Path("a.obj")], Path("b.obj"), Path("c.obj"), is_sequence=False, is_told=is_told)
+        found = chosen(job, (source, target), force=force)
+        assert isinstance(found.transfer, Understanding) and found.transfer.name == found.weights.name
+        assert loaded == (["human"] if source is target is PERSON else ["human", "animals"])
+        return found.weights.name, [each.misfit for each in found.standings]
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "weights", "misfits"),
+    [
+        (PERSON, PERSON, "human", [0.0005, 0.0005]),
+        (ANIMAL, ANIMAL, "animals", [0.002, 0.002]),
+        (BOX, ANIMAL, "animals", [0.1, 0.002]),
+        (ANIMAL, BOX, "animals", [0.002, 0.1]),
+        (BOX, PERSON, "human", [0.1, 0.0005]),
+        (BOX, BOX, "human", [0.1, 0.1]),
+    ],
+)
+@pytest.mark.parametrize("is_told", [False, True])
+def test_by_the_mesh_that_is_understood(
+    choose: Choose, source: Mesh, target: Mesh, weights: str, misfits: list[float], is_told: bool
+) -> None:
+    assert choose(source, target, is_told=is_told) == (weights, misfits)
+
+
+def test_one_of_each_is_refused_but_when_it_is_forced(choose: Choose) -> None:
+    for source, target, says in ((PERSON, ANIMAL, "a.obj is a person and b.obj is an animal"), (ANIMAL, PERSON, "")):
+        with pytest.raises(MeshError, match=f"{says}.*--force"):
+            choose(source, target)
+    assert choose(PERSON, ANIMAL, force=True) == ("animals", [0.03, 0.002])
+    assert choose(ANIMAL, PERSON, force=True) == ("human", [0.05, 0.0005])
+
+
+def test_a_checkpoint_is_one_of_a_run(tmp_path: Path) -> None:
+    for name in ("a.obj", "b.obj"):
+        (tmp_path / name).write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    words = [str(tmp_path / name) for name in ("a.obj", "b.obj")]
+    options = cli.parsed(["transfer", *words, "-o", str(tmp_path / "c.obj"), "--checkpoint", "4"])
+    with pytest.raises(RecipeError, match="add --model RUN"):
+        options.command(options)
