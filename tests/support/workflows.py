@@ -33,7 +33,7 @@ def rows_on(dataset: Dataset) -> list[Row]:
     """A row for each method and triple of the dataset's lists, its numbers drawn at random."""
     random = np.random.default_rng(0)
     return sorted(
-        Row(method, pose_type, number, *map(int, triple), *random.uniform(0.01, 0.02, 7).tolist())
+        Row(method, pose_type, number, *map(int, triple), *random.uniform(0.01, 0.02, 8).tolist())
         for pose_type in POSE_TYPES
         for number, triple in enumerate(dataset.evaluation_triples(pose_type))
         for method in ("DSFFNet", *NO_OPS)

@@ -156,6 +156,7 @@ def measure(
         metrics.mean_euclidean_error(output, truth) * metres * 1000,
         metrics.edge_length_ratio_error(output, truth, edges),
         metrics.normal_angle_error(output, truth, faces),
+        metrics.area_point_mesh_distance(output, truth, faces),
     )
     return [Score(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
 

@@ -99,6 +99,7 @@ class Score:
     millimetres: float
     edge_ratio: float
     normal_degrees: float
+    pmd_by_area: float
 
 
 @dataclass(frozen=True, order=True)

@@ -20,7 +20,7 @@ THEIRS = "paper"
 DEFINITIONS = """\
 - **PMD** point-wise mesh distance: mean over vertices and coordinates of (output - truth)^2 in the normalised box
   (each mesh centred and divided by half its longest box edge), times 1e4. **PMD re-centred**: after moving the
-  output's box onto the truth's.
+  output's box onto the truth's. **PMD by area**: vertices count by the area of their faces, not each alike.
 - **CD** Chamfer distance: mean squared distance to the nearest vertex, output to truth plus truth to output, times 1e4.
 - **EMD** earth mover's distance: mean distance under the best one-to-one assignment (exact) of {points} vertices, the
   same in both meshes, times 1e3.
@@ -43,6 +43,7 @@ class Column:
 COLUMNS = (
     Column("PMD x1e-4", "pmd", 1e4, 2),
     Column("PMD re-centred", "pmd_recentred", 1e4, 2),
+    Column("PMD by area", "pmd_by_area", 1e4, 2),
     Column("CD x1e-4", "chamfer", 1e4, 2),
     Column("EMD x1e-3", "earth_mover", 1e3, 2),
     Column("mm", "millimetres", 1.0, 1),

@@ -16,7 +16,7 @@ from training.evaluation.timing import Inference
 
 
 def row(method: str, pose_type: str, triple: int, pmd: float) -> Row:
-    return Row(method, pose_type, triple, 0, 0, 1, 1, pmd, pmd, 0.1, 0.2, 3.0, 0.04, 5.0)
+    return Row(method, pose_type, triple, 0, 0, 1, 1, pmd, pmd, 0.1, 0.2, 3.0, 0.04, 5.0, pmd)
 
 
 def rows_of(pmd: dict[str, float]) -> list[Row]:
@@ -52,7 +52,7 @@ def test_the_summary_means_what_it_says() -> None:
     rows = [row("DSFFNet", "seen", 0, 1e-4), row("DSFFNet", "seen", 1, 3e-4), row("target unchanged", "seen", 0, 5e-2)]
     assert mean_of(rows, method="DSFFNet", pose_type="seen", field="pmd") == pytest.approx(2e-4)
     lines = summary(rows).lines
-    assert lines[1] == ["seen", "DSFFNet", "2.00", "2.00", "1000.00", "200.00", "3.0", "0.040", "5.0"]
+    assert lines[1] == ["seen", "DSFFNet", "2.00", "2.00", "2.00", "1000.00", "200.00", "3.0", "0.040", "5.0"]
     assert [line[1] for line in lines[1:]] == ["DSFFNet", "target unchanged"]
     text = report(rows, title="T", about="A.", emd_points=64)
     assert "2 with seen poses" in text and "assignment (exact) of 64 vertices" in text

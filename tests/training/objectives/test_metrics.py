@@ -43,6 +43,20 @@ def test_recentred_distance_ignores_a_shift_and_uses_the_box_not_the_mean() -> N
     assert metrics.recentred_point_mesh_distance(prediction, other).tolist() == pytest.approx([4 / 9])
 
 
+def test_distance_by_area_weighs_a_vertex_by_its_faces_however_they_are_split() -> None:
+    square = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [9, 9, 9]])[None]
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    moved = square + torch.tensor([[3.0], [0], [0], [0], [100]]) * torch.tensor([0.0, 0, 1])
+    assert metrics.area_point_mesh_distance(moved, square, faces).item() == pytest.approx(3 * 1 / 3)  # a third of both
+    fine = torch.cat([square, torch.full((1, 1, 3), 1.0) * torch.tensor([1.0, 1, 0])], dim=1)  # its middle, all at rest
+    split = torch.tensor([[0, 1, 5], [1, 2, 5], [2, 3, 5], [3, 0, 5]])
+    lifted = torch.cat([moved, fine[:, 5:]], dim=1)
+    assert metrics.area_point_mesh_distance(lifted, fine, split).item() == pytest.approx(3 / 6)
+    assert math.isnan(metrics.area_point_mesh_distance(square * 0, square * 0, faces).item())
+    even = metrics.area_point_mesh_distance(square[:, :4] + 1, square[:, :4], faces)
+    assert even.item() == pytest.approx(metrics.point_mesh_distance(square + 1, square).item())
+
+
 def test_chamfer_distance_equals_brute_force_for_different_numbers_of_vertices() -> None:
     first, second = _random(2, 40, 0), _random(2, 25, 1)
     for value, p, t in zip(metrics.chamfer_distance(first, second), first, second, strict=True):

@@ -34,7 +34,7 @@ class Unchanged(nn.Module):
 
 def rows_of(dataset: Dataset, method: str, pmd: float) -> list[Row]:
     return [
-        Row(method, kind, place, *map(int, triple), pmd, pmd, 0.1, 0.2, 12.0, 0.3, 4.0)
+        Row(method, kind, place, *map(int, triple), pmd, pmd, 0.1, 0.2, 12.0, 0.3, 4.0, pmd)
         for kind in POSE_TYPES
         for place, triple in enumerate(dataset.evaluation_triples(kind))
     ]

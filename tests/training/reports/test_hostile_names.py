@@ -161,7 +161,7 @@ def test_the_viewer_shows_it_as_text(tmp_path: Path, name: str) -> None:
 
 def test_pictures_are_drawn_whatever_they_are_called(tmp_path: Path) -> None:
     """Neither mathematics that does not parse, nor letters that no font and no encoding has, nor their number."""
-    some, numbers, draw = [BYTES, "$x^", TERMINAL, "日本" * 130], [0.01] * 7, tmp_path / "drawn"
+    some, numbers, draw = [BYTES, "$x^", TERMINAL, "日本" * 130], [0.01] * 8, tmp_path / "drawn"
     cells = [
         GeneralisationRow(method, kind, kind, 0, 0, 0, 0, 0, 4, 4, *numbers)
         for kind in map(printable, some)
@@ -194,7 +194,7 @@ FORMULAS = ["=cmd|'/C calc'!A1", "+1+cmd", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "
 
 @pytest.mark.parametrize("word", [*FORMULAS, "-0.5", "+3", "-", "nan", "1,000", "DSFFNet", "", "'"])
 def test_no_spreadsheet_runs_a_csv_and_it_reads_back_as_it_was(tmp_path: Path, word: str) -> None:
-    row = Row(word, "unseen", 0, 1, 2, 3, 4, *([-0.5] * 7))
+    row = Row(word, "unseen", 0, 1, 2, 3, 4, *([-0.5] * 8))
     write_csv([row], tmp_path / "rows.csv", Row)
     with open(tmp_path / "rows.csv", encoding="utf-8", newline="") as file:
         (cells,) = csv.DictReader(file)
@@ -206,7 +206,7 @@ def test_no_spreadsheet_runs_a_csv_and_it_reads_back_as_it_was(tmp_path: Path, w
 
 
 def test_a_csv_takes_what_no_encoding_has(tmp_path: Path) -> None:
-    write_csv([Row(BYTES, "unseen", 0, 1, 2, 3, 4, *([0.5] * 7))], tmp_path / "rows.csv", Row)
+    write_csv([Row(BYTES, "unseen", 0, 1, 2, 3, 4, *([0.5] * 8))], tmp_path / "rows.csv", Row)
     assert read_csv(tmp_path / "rows.csv", Row)[0].method == printable(BYTES)
 
 

@@ -44,7 +44,7 @@ def curve(name: str, *pmd: float, finished: bool = True) -> RunCurve:
 def rows_of(method: str, pmd: float, *, pose_types: tuple[str, ...] = ("seen", "unseen"), count: int = 8) -> list[Row]:
     """Rows whose PMD is `pmd` +- a tenth, doubled on unseen poses."""
     return [
-        Row(method, kind, n, 0, 0, 1, 1, *[pmd * (1 + 0.1 * (-1) ** n) * (1 + (kind == "unseen"))] * 7)
+        Row(method, kind, n, 0, 0, 1, 1, *[pmd * (1 + 0.1 * (-1) ** n) * (1 + (kind == "unseen"))] * 8)
         for kind in pose_types
         for n in range(count)
     ]
