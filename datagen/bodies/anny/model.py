@@ -19,6 +19,7 @@ import scipy.sparse
 from filelock import FileLock
 from numpy.typing import NDArray
 
+from datagen.bodies.anny.first_load import read_in_bulk
 from datagen.bodies.anny.identities import Population, draw_local_changes, draw_uniform
 from datagen.bodies.anny.rigs import Bones, t_pose_corrections
 from datagen.bodies.anny.shape import AnnyShape
@@ -113,7 +114,7 @@ def _assets(recipe: AnnyBody) -> tuple[Asset, ...]:
 
 
 def _load_anny(recipe: AnnyBody) -> Any:
-    """Anny at rest, read from its cache, which the first use of a topology or rig fills (about 30 s).
+    """Anny at rest, read from its cache, which the first use of a topology or rig fills (about 10 s).
 
     Its blend shapes are taken as they come ("original"): compacted ones depend on the threads that compacted them.
     """
@@ -125,7 +126,7 @@ def _load_anny(recipe: AnnyBody) -> Any:
 
         cache = Path(get_anny_cache_path())
         try:
-            with _alone_with_whole_files(cache):
+            with _alone_with_whole_files(cache), read_in_bulk():
                 return anny.Anny(
                     rig=recipe.rig,
                     topology=recipe.topology,
