@@ -47,8 +47,8 @@ def main() -> None:
     """Transfer, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--people", default="human", help="weights of people")
-    parser.add_argument("--animals", default="animals", help="weights of animals")
+    parser.add_argument("--people", default="human", help="weights of people, empty: none")
+    parser.add_argument("--animals", default="animals", help="weights of animals, empty: none")
     options = parser.parse_args()
     people, animals = (
         PoseTransfer.from_run(weights_named(name)) if name else None for name in (options.people, options.animals)
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def stretched(target: Mesh, posed: Mesh) -> str:
-    """By what share edges grew or shrank."""
+    """By what share edges grew or shrank: two cells of a row, of the median edge and of one in a hundred."""
     edges = edges_of(target.faces)
     if not len(edges):
         return "no faces | "

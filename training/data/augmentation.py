@@ -133,26 +133,41 @@ def _edges_of(batch: Batch, row: int) -> Tensor:
 
 def _some_of_the_source(batch: Batch, fraction: float, random: Sequence[torch.Generator]) -> Batch:
     """A random subset of each source, in its own order."""
-    sources = []
+    rows = []
     for mesh, count, own in zip(batch.source, _counts(batch), random, strict=True):
         kept = max(1, round(fraction * count))
-        sources.append(mesh[torch.randperm(count, generator=own, device=mesh.device)[:kept].sort().values])
-    counts = counts_of(np.array([len(mesh) for mesh in sources]))
-    return replace(batch, source=torch.nn.utils.rnn.pad_sequence(sources, batch_first=True), source_counts=counts)
+        rows.append(torch.randperm(count, generator=own, device=mesh.device)[:kept].sort().values)
+    return _of_rows(batch, rows)
+
+
+def _of_rows(batch: Batch, rows: Sequence[Tensor]) -> Batch:
+    """Each source's vertices of these numbers, padded; ``source_rows`` stay those of the mesh in the dataset."""
+    counts = counts_of(np.array([len(own) for own in rows]))
+    numbers = torch.nn.utils.rnn.pad_sequence(list(rows), batch_first=True)
+    there = torch.arange(numbers.shape[1], device=numbers.device) < torch.tensor([len(own) for own in rows])[
+        :, None
+    ].to(numbers.device)
+    source = _taken(batch.source, numbers) * there[..., None]
+    before = batch.source_rows
+    return replace(
+        batch,
+        source=source,
+        source_counts=counts,
+        source_rows=numbers if before is None else before.gather(1, numbers) * there,
+    )
 
 
 def _cut(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
     """Each source without what lies about one of its vertices, boxed by what is left."""
-    sources, rows = [], []
-    for mesh, count, own in zip(batch.source, _counts(batch), random, strict=True):
-        middle = mesh[torch.randint(count, (1,), generator=own, device=mesh.device)]
-        share = most * torch.rand((), generator=own, device=mesh.device)
+    device = batch.source.device
+    shares = (most * torch.stack([torch.rand((), generator=own, device=device) for own in random])).tolist()
+    rows = []
+    for mesh, count, share, own in zip(batch.source, _counts(batch), shares, random, strict=True):
+        middle = mesh[torch.randint(count, (1,), generator=own, device=device)]
         far = (mesh[:count] - middle).square().sum(dim=1).argsort(descending=True)
-        rows.append(far[: max(1, round(count * (1 - float(share))))].sort().values)
-        sources.append(mesh[rows[-1]])
-    counts = counts_of(np.array([len(mesh) for mesh in sources]))
-    left, numbers = (torch.nn.utils.rnn.pad_sequence(each, batch_first=True) for each in (sources, rows))
-    return replace(batch, source=_boxed(left, counts), source_counts=counts, source_rows=numbers)
+        rows.append(far[: max(1, round(count * (1 - share)))].sort().values)
+    batch = _of_rows(batch, rows)
+    return replace(batch, source=_boxed(batch.source, batch.source_counts))
 
 
 def _noisy(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:

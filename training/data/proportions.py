@@ -8,14 +8,14 @@ from torch import Tensor
 
 from datagen.characters.joint_names import pairs
 from training.data.batch import Batch
-from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
+from training.networks.layers.rigid_parts import ancestors, box, moved_joints, skinned
 from training.objectives.parts import Posed
 
 
 def of_other_proportions(
     batch: Batch, deviation: float, joints: Mapping[str, str | None], random: Sequence[torch.Generator]
 ) -> Batch:
-    """Every other triple with parts that are larger and smaller, left and right alike, posed by skinning.
+    """Half of the triples, by chance, with parts that are larger and smaller, left and right alike, posed by skinning.
 
     Parameters
     ----------
@@ -56,16 +56,15 @@ def _resized(posed: Posed, sizes: Tensor, parents: Tensor, above: Tensor) -> Pos
     still = sizes[:, :, None, None] * torch.eye(3, dtype=sizes.dtype, device=sizes.device)
     joints = moved_joints(posed.rest_joints, still, parents, above)
     rest = skinned(posed.rest, posed.weights, still, posed.rest_joints, joints)
-    half = (rest.amax(1) - rest.amin(1)).amax(1) / (posed.rest.amax(1) - posed.rest.amin(1)).amax(1)
-    return replace(posed, rest=rest / half[:, None, None], rest_joints=joints / half[:, None, None])
+    times = box(rest)[1] / box(posed.rest)[1]  # by the vertices that are taken: nearly that of all
+    return replace(posed, rest=rest / times, rest_joints=joints / times)
 
 
 def _placed(posed: Posed, rotations: Tensor, parents: Tensor, above: Tensor) -> tuple[Tensor, Posed]:
-    """The body's vertices [b, n, 3] with its parts turned so, in their box, and the same of its joints."""
+    """The body's vertices [b, n, 3] with its parts turned so, in the box of those that are taken, and its joints."""
     joints = moved_joints(posed.rest_joints, rotations, parents, above)
     vertices = skinned(posed.rest, posed.weights, rotations, posed.rest_joints, joints)
-    low, high = vertices.aminmax(dim=1, keepdim=True)
-    middle, half = (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True)
+    middle, half = box(vertices)
     return (vertices - middle) / half, replace(posed, rotations=rotations, joints=(joints - middle) / half)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 _MOMENTUM = 0.95
 _FEWEST = 32
-"""Rows and columns of what counts as a matrix: first and last layers, of few channels, and embeddings do not."""
+"""Rows and columns of what counts as a matrix; layers from or to a few channels, as coordinates are, do not."""
 _SHARE_OF_ADAM = 0.2
 """Root mean square of a step of AdamW at a learning rate of 1 (Liu et al. 2025, section 2.2): both share one."""
 _ITERATIONS = ((3.4445, -4.7750, 2.0315),) * 5
@@ -21,7 +21,7 @@ class Muon(torch.optim.AdamW):
     """Muon (Jordan et al. 2024), at AdamW's learning rates and weight decay (Liu et al. 2025, equation 4).
 
     PyTorch's own takes matrices alone, one at a time and in bfloat16, which many CPUs have not; here those of one shape
-    go together, in float32. Each parameter of more than two axes is the matrix of its first one by the others.
+    go together, in their own precision. A parameter of more than two axes is the matrix of its first by the others.
 
     Parameters
     ----------
@@ -63,6 +63,7 @@ class Muon(torch.optim.AdamW):
         for parameter, own in zip(matrices, gradients, strict=True):
             state = self.state[parameter]
             if not state:
+                # AdamW, whose class this is, asks every state for a step when it is loaded
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
             gradient = own if bad is None else own.masked_fill(bad > 0, 0)
             state["momentum"].lerp_(gradient, (1 - _MOMENTUM) * (1 if bad is None else 1 - bad))

@@ -48,12 +48,14 @@ def load_optimiser(optimiser: torch.optim.Optimizer, state: Mapping[str, Any]) -
         They are not those of the parameters.
     """
     optimiser.load_state_dict({"state": state["state"], "param_groups": optimiser.state_dict()["param_groups"]})
+    matrices = set(map(id, optimiser.param_groups[0]["params"])) if isinstance(optimiser, Muon) else set()
     for parameter, moments in optimiser.state.items():
-        if not (isinstance(parameter, Tensor) and moments.keys() in _MOMENTS and _fit(moments, parameter)):
+        names = _MOMENTUM if id(parameter) in matrices else _MOMENTS
+        if not (isinstance(parameter, Tensor) and moments.keys() == names and _fit(moments, parameter)):
             raise ValueError("the optimiser's state is that of other parameters")
 
 
-_MOMENTS = ({"step", "exp_avg", "exp_avg_sq"}, {"step", "momentum"})
+_MOMENTS, _MOMENTUM = {"step", "exp_avg", "exp_avg_sq"}, {"step", "momentum"}
 """What Adam and AdamW keep of a parameter, and Muon of a matrix."""
 
 

@@ -38,7 +38,8 @@ def understanding_of(network: Parts) -> Understanding:
 
 STRANGE = 0.01
 """Misfit above which a mesh is no body that the network knows, however it is turned."""
-_KNOWN = 0.003  # misfit up to which a mesh stands upright
+KNOWN = 0.003
+"""Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
@@ -98,10 +99,10 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return Standing(found.way, found.misfit)
 
     as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
-    if as_it_is.misfit <= min(_KNOWN, *(_CLEARLY * other.misfit for other in others)):
+    if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
         return faced(as_it_is) if abs(as_it_is.facing) > _STRAIGHT else Standing(np.eye(3), as_it_is.misfit)
     best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
-    if best.misfit <= _KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
+    if best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
         return faced(best)
     ways = [_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES]
     for size in _TILTS:

@@ -23,6 +23,7 @@ from training.networks.layers.input_checks import check_pair
 from training.networks.layers.modulation import full_precision
 from training.networks.layers.rigid_parts import (
     ancestors,
+    box,
     matrices,
     moved_joints,
     rotations_from_six,
@@ -286,9 +287,8 @@ class Attention(nn.Module):
 
 def boxed(vertices: Tensor) -> Tensor:
     """Return vertices [b, n, 3] in their own box: its middle at the origin, half its longest edge one."""
-    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
-    half = ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
-    return (vertices - (low + high) / 2) / half
+    middle, half = box(vertices)
+    return (vertices - middle) / half
 
 
 def _products(first: Tensor, second: Tensor) -> Tensor:

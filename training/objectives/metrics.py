@@ -2,13 +2,14 @@
 
 Definitions differ between papers, and so do units: print them beside every table. "Box" is the unit of normalised
 coordinates, half the longest edge of a mesh's bounding box. With p and t corresponding vertices of prediction and
-truth, n their number, and s a one-to-one assignment:
+truth, n their number, a their share of the truth's area, and s a one-to-one assignment:
 
 ===============================  =================================================  =======  ===============
 function                         formula                                            unit     tables print
 ===============================  =================================================  =======  ===============
 point_mesh_distance              sum_i |p_i - t_i|^2 / (3 n)                        box^2    in 1e-4
 recentred_point_mesh_distance    the same, prediction's box moved onto the truth's  box^2    in 1e-4
+area_point_mesh_distance         sum_i a_i |p_i - t_i|^2 / (3 sum_i a_i)            box^2    in 1e-4
 chamfer_distance                 mean_i min_j |p_i - t_j|^2 + mean_j min_i (same)   box^2    in 1e-4
 earth_mover_distance             min_s mean_i |p_i - t_s(i)|                        box      in 1e-3
 mean_euclidean_error             mean_i |p_i - t_i|                                 input's  in millimetres
@@ -91,9 +92,9 @@ def area_point_mesh_distance(prediction: Tensor, truth: Tensor, faces: Tensor) -
     :func:`point_mesh_distance`; `faces`: ``[f, 3]`` integers. NaN where the truth has no area.
     """
     first, second = _pair(prediction, truth)
-    corners = faces.to(second.device).long()
-    thirds = _normals(second, corners).norm(dim=2, keepdim=True).expand(-1, -1, 3).flatten(1)
-    areas = torch.zeros_like(second[..., 0]).index_add_(1, corners.flatten(), thirds)
+    corners, right = faces.cpu().long(), second.cpu()  # on a GPU the sums would come in another order each time
+    thirds = _normals(right, corners).norm(dim=2, keepdim=True).expand(-1, -1, 3).flatten(1)
+    areas = torch.zeros_like(right[..., 0]).index_add_(1, corners.flatten(), thirds).to(second.device)
     weighted = (areas * (first - second).square().mean(dim=2)).sum(dim=1) / areas.sum(dim=1)
     return _where_finite(weighted, first, second)
 

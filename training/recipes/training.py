@@ -122,8 +122,8 @@ class AugmentationRecipe(Frozen):
         0.0,
         ge=0,
         le=1,
-        description="network parts: standard deviation of the logarithm of the factors by which the parts of every "
-        "other triple's bodies are made larger or smaller",
+        description="network parts: standard deviation of the logarithm of the factors by which the bodies' parts are "
+        "made larger or smaller, in half of the triples, by chance",
     )
     shuffle: bool = Field(
         False,
@@ -225,8 +225,14 @@ class TrainingRecipe(Frozen):
     @model_validator(mode="after")
     def _can_be_meant(self) -> "TrainingRecipe":
         kept, subset = self.augmentation.vertices, self.augmentation.subset
-        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and (kept < 1 or subset):
-            field, whole = (f"vertices {kept}", "vertices to 1") if kept < 1 else (f"subset {subset}", "subset to null")
+        thinned = {
+            f"vertices {kept}": ("vertices to 1", kept < 1),
+            f"subset {subset}": ("subset to null", subset is not None),
+            f"source_holes {self.augmentation.source_holes}": ("source_holes to 0", self.augmentation.source_holes > 0),
+        }
+        found = next(((field, whole) for field, (whole, is_set) in thinned.items() if is_set), None)
+        if isinstance(self.network, NptRecipe) and self.network.variant == "origin" and found:
+            field, whole = found
             raise ValueError(
                 f"network.variant 'origin' pairs source and target by index, but augmentation.{field} "
                 f"leaves vertices out: set augmentation.{whole}, or network.variant to maxpool"

@@ -33,7 +33,7 @@ def _transfer_options(made: Parser) -> None:
     made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
     made.add_argument("--source-geometry", metavar="NAME", help="which of several geometries of a GLB has the pose")
     made.add_argument("--target-geometry", metavar="NAME", help="which of several geometries of a GLB is posed")
-    made.add_argument("--force", action="store_true", help="pose an animal like a person, or a person like an animal")
+    made.add_argument("--force", action="store_true", help="without --model: pose even a person like an animal")
     _add_standing(made)
     _add_extras(made)
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
@@ -96,6 +96,8 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path | None]:
             raise RecipeError("--checkpoint is one of a run's: add --model RUN")
         yield None
         return
+    if options.force:
+        raise RecipeError("--force is for weights that are chosen by the meshes: leave it out, or --model")
     if not options.model.startswith("models:/"):
         from workflows.pipeline.weights_argument import evaluated
 

@@ -6,7 +6,12 @@ KINDS = {"human": "a person", "animals": "an animal on four legs"}
 """Those that a transfer chooses from where none are named, and what they pose."""
 
 
+def own_weights(name: str) -> Path:
+    """The folder of weights that come with the project."""
+    return Path(__file__).parent / name
+
+
 def weights_named(name: str) -> Path:
     """The path of weights that a person names: a path that is there, or the name of some that come with the project."""
-    place, own = Path(name), Path(__file__).parent / name
+    place, own = Path(name), own_weights(name)
     return own if place.name == name and not place.exists() and own.is_dir() else place

@@ -6,9 +6,9 @@ from pathlib import Path
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
 from training.inference.orientation import Axes
-from training.inference.standing import STRANGE, Standing
+from training.inference.standing import KNOWN, STRANGE, Standing
 from training.inference.transfer import PoseTransfer
-from workflows.pretrained import KINDS, weights_named
+from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
@@ -28,11 +28,6 @@ class Chosen:
         transfer = PoseTransfer.from_run(weights)
         return cls(weights, transfer, standings(transfer, job, meshes))
 
-    @property
-    def knows_both(self) -> bool:
-        """Whether source and target are bodies of the kind that the network knows."""
-        return all(found.misfit <= STRANGE for found in self.standings)
-
 
 def standings(transfer: PoseTransfer, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> Pair:
     """How source and target stand: as a person says, or as the network finds."""
@@ -49,17 +44,20 @@ def _told(transfer: PoseTransfer, axes: Axes, mesh: Mesh) -> Standing:
 
 
 def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool) -> Chosen:
-    """Return the weights that know both meshes; of meshes that none knows, those of people.
+    """Return the weights that know both meshes best; of meshes that none knows, those of people.
+
+    The others are not asked where people's know both well: among all the ways to turn an animal there may be one in
+    which it passes for a person, but worse by far than people do.
 
     Raises
     ------
     MeshError
         One is a person and one an animal, and it is not forced.
     """
-    people = Chosen.of(weights_named("human"), job, meshes)
-    if people.knows_both:
+    people = Chosen.of(own_weights("human"), job, meshes)
+    if all(found.misfit <= KNOWN for found in people.standings):
         return people
-    every = {"human": people} | {name: Chosen.of(weights_named(name), job, meshes) for name in KINDS if name != "human"}
+    every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes) for name in KINDS if name != "human"}
     source, target = (_kind(every, place) for place in range(2))
     if source and target and source != target and not force:
         raise MeshError(

@@ -59,7 +59,7 @@ class TransferWork:
         Raises
         ------
         MeshError
-            A person is to be posed like an animal, and it is not forced.
+            Of weights to choose from: one of the meshes is a person and one an animal, and it is not forced.
         """
         meshes = first, target.mesh
         if weights is None:

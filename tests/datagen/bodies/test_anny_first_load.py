@@ -43,7 +43,15 @@ def test_bits_are_those_of_annys_own_loader(dtype: torch.dtype, capsys: pytest.C
 
 
 def test_what_is_no_blend_shape_is_refused(tmp_path: Path) -> None:
-    wrong = {"5 0 0 1\n": "moves vertex 5", "1 0 0\n": "reshape", "1 0 0 1\n2 0\n": "columns", "1 0 0 x\n": "convert"}
+    wrong = {
+        "5 0 0 1\n": "moves vertex 5",
+        "3 0 0 0\n-1 0 0 0\n": "moves vertex -1",
+        "1.5 0 0 0\n": "moves vertex 1.5",
+        "1 0 0\n": "lines of 3",
+        "1 0 0 0 2 0 0 0\n": "lines of 8",
+        "1 0 0 1\n2 0\n": "columns",
+        "1 0 0 x\n": "convert",
+    }
     for text, says in wrong.items():
         path = tmp_path / "x.target.gz"
         path.write_bytes(gzip.compress(text.encode()))

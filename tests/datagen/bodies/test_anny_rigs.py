@@ -1,6 +1,6 @@
 """Anny's rigs and topologies: one SMPL pose draws alike on all of them.
 
-What loads another rig than the default's or a large topology is slow: a fresh cache takes half a minute for each rig.
+What loads another rig than the default's or a large topology is slow: a fresh cache takes ten seconds for each rig.
 """
 
 from typing import Any, get_args

@@ -243,6 +243,19 @@ def test_noise_has_another_deviation_up_to_the_largest_each_time(mixed: Dataset)
     assert np.median(deviations) == pytest.approx(0.05, abs=0.03), "0.2 times the square of a uniform number"
 
 
+def test_a_source_that_is_cut_and_thinned_knows_which_of_its_vertices_are_left(mixed: Dataset) -> None:
+    (plain,), (cut,), (both,) = (
+        augmented(mixed, step=2, **changes)
+        for changes in ({}, {"source_holes": 0.5}, {"source_holes": 0.5, "vertices": 0.5})
+    )
+    assert both.source_rows is not None and both.source_counts is not None and cut.source_counts is not None
+    assert all(half == round(whole / 2) for half, whole in zip(both.source_counts, cut.source_counts, strict=True))
+    for mesh, own, rows, count in zip(plain.source, both.source, both.source_rows, both.source_counts, strict=True):
+        sizes = [float(torch.pdist(each).max()) for each in (mesh[rows[:count]], own[:count])]
+        torch.testing.assert_close(torch.pdist(own[:count]), torch.pdist(mesh[rows[:count]]) * (sizes[1] / sizes[0]))
+        assert not own[count:].any()
+
+
 def test_a_hole_is_what_lies_about_a_vertex_and_the_rest_has_a_box_of_its_own(mixed: Dataset) -> None:
     (plain,), (batch,) = (augmented(mixed, step=2, source_holes=share) for share in (0, 0.6))
     assert batch.source_counts is not None and plain.source_counts is not None and batch.source_rows is not None

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import LEG
+from tests.support.recipes import LEG, PARTS, tiny_training
+from training.data.augmentation import Augmentation
 from training.data.batch import Batch
 from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
@@ -19,8 +20,12 @@ PARENTS, ABOVE = torch.tensor([0, 0]), ancestors([-1, 0])
 
 
 @pytest.fixture
-def told(dataset: str) -> Batch:
-    legs = open_dataset(dataset)
+def legs(dataset: str) -> Dataset:
+    return open_dataset(dataset)
+
+
+@pytest.fixture
+def told(legs: Dataset) -> Batch:
     table = RigTable(legs, legs.identities("training"), LEG, device="cpu")
     return table.posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
 
@@ -77,8 +82,30 @@ def test_bones_of_a_part_grow_with_it_and_none_at_all_without_a_deviation(told: 
     assert float((after / before).min()) < 0.95 and float((after / before).max()) > 1.05
 
 
-def test_left_and_right_are_alike(dataset: str) -> None:
-    legs: Dataset = open_dataset(dataset)
+def test_a_batch_is_told_of_its_rigs_before_its_bodies_change_and_made_noisy_after(legs: Dataset) -> None:
+    """What an augmentation does in a row fits together: vertices but for the noise are the bodies that are told of."""
+    table = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
+    about: dict[str, float] = {"subset": 24, "turn": 25, "source_holes": 0.3, "proportions": 0.3}
+    quiet, noisy = (
+        Augmentation(tiny_training(**{**PARTS, "augmentation": {**about, **more}}), table.posed)(
+            TRIPLES, batch, step=1, first=0
+        )
+        for more in ({}, {"source_noise": 0.2})
+    )
+    assert quiet.posed is not None and noisy.posed is not None
+    assert torch.equal(quiet.posed[0].joints, noisy.posed[0].joints), "noise comes last"
+    assert not torch.equal(quiet.source, noisy.source) and torch.equal(quiet.target, noisy.target)
+    for meshes, posed in ((quiet.source, quiet.posed[0]), (quiet.target, quiet.posed[1])):
+        joints = moved_joints(posed.rest_joints, posed.rotations, PARENTS, ABOVE)
+        vertices = skinned(posed.rest, posed.weights, posed.rotations, posed.rest_joints, joints)
+        for mesh, its in zip(meshes, vertices, strict=True):
+            own, right = mesh - mesh.mean(0), its - its.mean(0)
+            scale = (own * right).sum() / right.square().sum()
+            torch.testing.assert_close(own, right * scale, atol=1e-2, rtol=0)
+
+
+def test_left_and_right_are_alike(legs: Dataset) -> None:
     joints = {"left_hip": None, "left_knee": "left_hip"}
     both: dict[str, str | None] = {"pelvis": None, **{a: b or "pelvis" for a, b in joints.items()}}
     both |= {a.replace("left", "right"): (b or "pelvis").replace("left", "right") for a, b in joints.items()}

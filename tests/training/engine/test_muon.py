@@ -64,6 +64,15 @@ def test_matrices_move_as_by_pytorchs_muon_and_all_else_as_by_adamw() -> None:
     for name in ("0.weight", "2.weight"):
         error = float((moved[name] - muon[name]).norm() / (moved[name] - before[name]).norm())
         assert error < 0.05, "PyTorch's is in bfloat16"
+    kernel = before["3.weight"][..., 0].clone().requires_grad_()
+    muon_of_kernel = torch.optim.Muon([kernel], lr=0.01, weight_decay=0.1, adjust_lr_fn="match_rms_adamw")
+    for step in range(2):
+        random = torch.Generator().manual_seed(step)
+        drawn = {name: torch.randn(parameter.shape, generator=random) for name, parameter in first.named_parameters()}
+        kernel.grad = drawn["3.weight"][..., 0]
+        muon_of_kernel.step()
+    error = float((moved["3.weight"][..., 0] - kernel.detach()).norm() / (kernel.detach() - before["3.weight"][..., 0]).norm())
+    assert error < 0.05, "a convolution is a matrix of its first axis by the others"
     alike = {name for name in moved if torch.equal(moved[name], adamw[name])}
     assert alike == {"0.bias", "2.bias", "3.bias", "4.weight", "4.bias"}
 
@@ -77,7 +86,8 @@ def test_a_step_that_is_not_finite_leaves_all_as_it_is() -> None:
     optimiser.step()
     assert all(torch.equal(value, before[name]) for name, value in own.state_dict().items())
     now = optimiser.state_dict()["state"]
-    assert all(torch.equal(now[number]["momentum"], its["momentum"]) for number, its in moments.items() if len(its) < 3)
+    for number, its in moments.items():
+        assert now[number].keys() == its.keys() and all(torch.equal(now[number][name], its[name]) for name in its)
     assert sum("momentum" in its for its in moments.values()) == 3
 
 
@@ -91,6 +101,20 @@ def test_it_resumes_to_the_same_bits_and_refuses_the_state_of_others() -> None:
     learn(half, resumed, range(2, 4))
     found: dict[str, Tensor] = half.state_dict()
     assert all(torch.equal(value, found[name]) for name, value in whole.state_dict().items())
-    state["state"][0] = {"step": torch.zeros(()), "momentum": torch.zeros(3)}
-    with pytest.raises(ValueError, match="that of other parameters"):
-        load_optimiser(resumed, state)
+    learned = of(tiny_training(), steps=1)[1].state_dict()
+    for its in ({**state["state"][0], "momentum": torch.zeros(3)}, learned["state"][0]):
+        wrong = {**state, "state": {**state["state"], 0: its}}
+        with pytest.raises(ValueError, match="that of other parameters"):
+            load_optimiser(resumed, wrong)
+
+
+def test_it_learns_in_float64_as_in_float32() -> None:
+    exact, rough = network().double(), network()
+    for own in (exact, rough):
+        optimiser = build_optimiser(own, RECIPE)
+        for name, parameter in own.named_parameters():
+            random = torch.Generator().manual_seed(len(name))
+            parameter.grad = torch.randn(parameter.shape, generator=random).to(parameter.dtype)
+        optimiser.step()
+    for name, value in exact.state_dict().items():
+        torch.testing.assert_close(value.float(), rough.state_dict()[name], atol=1e-5, rtol=0)

@@ -43,6 +43,7 @@ def test_what_cannot_be_meant_says_what_to_set(values: dict[str, Any], message: 
     "values",
     [
         {"network": ORIGIN, "augmentation": {"source_noise": 0.1}},
+        {"network": {"name": "npt"}, "augmentation": {"source_holes": 0.5}},
         {"network": {"name": "npt"}, "augmentation": {"vertices": 0.5}},
         {"early_stopping": 3, "steps": 501},
         {"early_stopping": 3},

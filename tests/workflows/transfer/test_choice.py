@@ -7,8 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.bodies import load_body
 from datagen.common.errors import MeshError, RecipeError
+from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh
+from datagen.poses import draw_poses
+from datagen.recipe import AnnyBody, PoseRecipe
+from tests.support.shapes.real_animals import require_animals
 from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
 from workflows.cli import main as cli
@@ -17,7 +22,8 @@ from workflows.transfer.job import TransferJob
 
 FACES = np.array([[0, 1, 2]])
 PERSON, ANIMAL, BOX = (Mesh(np.eye(3) * size, FACES) for size in (1.0, 2.0, 3.0))
-MISFITS = {("human", 1): 0.0005, ("human", 2): 0.05, ("animals", 1): 0.03, ("animals", 2): 0.002}
+MISFITS = {("human", 1): 0.0005, ("human", 2): 0.005, ("animals", 1): 0.006, ("animals", 2): 0.002}
+"""As they are: a way is found in which an animal passes for a person, and a person for an animal, but worse."""
 Choose = Callable[..., tuple[str, list[float]]]
 
 
@@ -77,14 +83,43 @@ def test_one_of_each_is_refused_but_when_it_is_forced(choose: Choose) -> None:
     for source, target, says in ((PERSON, ANIMAL, "a.obj is a person and b.obj is an animal"), (ANIMAL, PERSON, "")):
         with pytest.raises(MeshError, match=f"{says}.*--force"):
             choose(source, target)
-    assert choose(PERSON, ANIMAL, force=True) == ("animals", [0.03, 0.002])
-    assert choose(ANIMAL, PERSON, force=True) == ("human", [0.05, 0.0005])
+    assert choose(PERSON, ANIMAL, force=True) == ("animals", [0.006, 0.002])
+    assert choose(ANIMAL, PERSON, force=True) == ("human", [0.005, 0.0005])
 
 
-def test_a_checkpoint_is_one_of_a_run(tmp_path: Path) -> None:
-    for name in ("a.obj", "b.obj"):
-        (tmp_path / name).write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
-    words = [str(tmp_path / name) for name in ("a.obj", "b.obj")]
-    options = cli.parsed(["transfer", *words, "-o", str(tmp_path / "c.obj"), "--checkpoint", "4"])
+def transfer(folder: Path, *words: object) -> None:
+    options = cli.parsed(["transfer", "-o", str(folder / "out.obj"), *map(str, words)])
+    options.command(options)
+
+
+def test_options_that_go_with_weights_of_ones_own_or_with_chosen_ones(tmp_path: Path) -> None:
+    meshes = [tmp_path / name for name in ("a.obj", "b.obj")]
+    for mesh in meshes:
+        mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
     with pytest.raises(RecipeError, match="add --model RUN"):
-        options.command(options)
+        transfer(tmp_path, *meshes, "--checkpoint", 4)
+    with pytest.raises(RecipeError, match="leave it out, or --model"):
+        transfer(tmp_path, *meshes, "--force", "--model", "human")
+
+
+def test_the_weights_that_come_along_tell_people_from_animals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    animals = {path.stem: path for path in require_animals().glob("*.glb")}
+    body = load_body(AnnyBody(topology="notoes_collapse5pc"))
+    who = body.draw_identity(np.random.default_rng(3), 3)
+    for name, vertices in zip("ab", body.vertices(who, draw_poses(PoseRecipe(seed=3), range(2))), strict=True):
+        save_mesh(Mesh(vertices.astype(np.float64), body.faces(who)), tmp_path / f"{name}.obj")
+    (tmp_path / "human").mkdir()  # a folder of meshes, say
+    (tmp_path / "animals").mkdir()
+    monkeypatch.chdir(tmp_path)
+    transfer(tmp_path, "a.obj", "b.obj")
+    assert "by the weights human" in capsys.readouterr().out
+    for source, target in (("deer", "fox"), ("donkey", "horse_white"), ("wolf", "cow")):
+        transfer(tmp_path, animals[source], animals[target])
+        assert "by the weights animals" in capsys.readouterr().out, (source, target)
+    for first, second in (("a.obj", animals["deer"]), (animals["donkey"], "b.obj")):
+        with pytest.raises(MeshError, match="is an animal on four legs"):
+            transfer(tmp_path, first, second)
+    transfer(tmp_path, "a.obj", animals["deer"], "--force")
+    assert "by the weights animals" in capsys.readouterr().out

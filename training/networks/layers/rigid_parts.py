@@ -22,6 +22,12 @@ def matrices(numbers: Tensor) -> Tensor:
     return numbers.reshape(*numbers.shape[:-1], 3, 3)
 
 
+def box(vertices: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the middle [b, 1, 3] and half the longest edge [b, 1, 1] of the boxes of vertices [b, n, 3]."""
+    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
+    return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
+
+
 def about_vertical(cosine: Tensor, sine: Tensor) -> Tensor:
     """Return rotations [..., 3, 3] about Y, from +Z to +X, by the cosines and sines [...] of their angles."""
     zero = torch.zeros_like(cosine)
