@@ -71,7 +71,9 @@ def test_matrices_move_as_by_pytorchs_muon_and_all_else_as_by_adamw() -> None:
         drawn = {name: torch.randn(parameter.shape, generator=random) for name, parameter in first.named_parameters()}
         kernel.grad = drawn["3.weight"][..., 0]
         muon_of_kernel.step()
-    error = float((moved["3.weight"][..., 0] - kernel.detach()).norm() / (kernel.detach() - before["3.weight"][..., 0]).norm())
+    error = float(
+        (moved["3.weight"][..., 0] - kernel.detach()).norm() / (kernel.detach() - before["3.weight"][..., 0]).norm()
+    )
     assert error < 0.05, "a convolution is a matrix of its first axis by the others"
     alike = {name for name in moved if torch.equal(moved[name], adamw[name])}
     assert alike == {"0.bias", "2.bias", "3.bias", "4.weight", "4.bias"}

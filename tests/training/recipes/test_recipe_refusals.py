@@ -22,6 +22,14 @@ ORIGIN = {"name": "npt", "variant": "origin"}
             "'origin' pairs source and target by index, but augmentation.shuffle is true: set augmentation.shuffle to",
         ),
         (
+            {"network": ORIGIN, "augmentation": {"source_holes": 0.2}},
+            "augmentation.source_holes 0.2 leaves vertices out: set augmentation.source_holes to 0, or",
+        ),
+        (
+            {"augmentation": {"proportions": 0.2}},
+            "needs the parts that network 'parts' is told of, but the network is 'dsffnet': set augmentation.proportions",
+        ),
+        (
             {"early_stopping": 3, "steps": 400},
             "with evaluate_every 500 there is none before the last of 400 steps: set evaluate_every lower",
         ),
