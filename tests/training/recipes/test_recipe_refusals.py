@@ -27,7 +27,7 @@ ORIGIN = {"name": "npt", "variant": "origin"}
         ),
         (
             {"augmentation": {"proportions": 0.2}},
-            "needs the parts that network 'parts' is told of, but the network is 'dsffnet': set augmentation.proportions",
+            "needs the parts that network 'parts' is told of, but the network is 'dsffnet': set augmentation",
         ),
         (
             {"early_stopping": 3, "steps": 400},
