@@ -208,7 +208,8 @@ def is_finished(checkpoint: Checkpoint, last_step: int) -> bool:
 def export_weights(checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype | None = None) -> None:
     """Write a checkpoint's weights (their moving average, where it keeps one) and manifest, without training's state.
 
-    ``dtype``, e.g. torch.bfloat16 or torch.float16, makes the file half as large; networks load it in float32.
+    ``dtype``, e.g. torch.bfloat16 or torch.float16, makes the file half as large; networks load it in float32. Of what
+    the training began with (``start_from``) the name is kept, not where it lay on this machine.
 
     Raises
     ------
@@ -221,6 +222,8 @@ def export_weights(checkpoint: Checkpoint, folder: Path, *, dtype: torch.dtype |
     if dtype is not None:
         weights = cast_weights(weights, dtype)
     about = {name: getattr(checkpoint, name) for name in ("step", "recipe", "dataset", "dataset_sha256")}
+    if began := about["recipe"].get("start_from"):
+        about["recipe"] = {**about["recipe"], "start_from": Path(began).name}
     commit_into(folder, {**about, "versions": _versions()}, {WEIGHTS: weights_writer(weights, about)})
 
 

@@ -35,8 +35,6 @@ from training.recipes.networks import PEOPLE
 _VARIANCE_FLOOR = 1e-5
 _SHARPNESS = 2.0
 """Power of the weights that vertices are posed by: the network's smear over its doubts."""
-_CORRECTIONS = 2
-"""Of the rotations, after the output was read in its turn; one that is no better is not taken."""
 
 
 class Reading(NamedTuple):
@@ -117,7 +115,7 @@ class Parts(nn.Module):
         """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
 
         Outside of training mode weights are sharpened, and the output is read in its turn: errors in reading that
-        source and output share, being in one pose, cancel in the correction.
+        source and output share, being in one pose, cancel in the correction. One that is no better is not taken.
 
         Raises
         ------
@@ -185,18 +183,17 @@ class Parts(nn.Module):
         own = self.read(target, drawn)
         weights = (_SHARPNESS * own.logits).softmax(2)
         turns = wanted @ own.rotations.mT
-        best = output = self.posed(target, weights, own.joints, turns)
-        least = torch.full_like(best[:, 0, 0], torch.inf)
-        for correction in range(_CORRECTIONS + 1):
+
+        def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
             again = with_masses(drawn.rows, taken(output, drawn.rows), drawn.masses > 0)
             found = self.read(again.vertices, again).rotations
-            missing = (wanted - found).square().sum((1, 2, 3))
-            best = torch.where((missing <= least)[:, None, None], output, best)
-            least = torch.minimum(least, missing)
-            if correction < _CORRECTIONS:
-                turns = wanted @ found.mT @ turns
-                output = self.posed(target, weights, own.joints, turns)
-        return best
+            return found, (wanted - found).square().sum((1, 2, 3))
+
+        output = self.posed(target, weights, own.joints, turns)
+        found, missing = read_again(output)
+        corrected = self.posed(target, weights, own.joints, wanted @ found.mT @ turns)
+        is_better = read_again(corrected)[1] <= missing
+        return torch.where(is_better[:, None, None], corrected, output)
 
     def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Features [b, n, width] of vertices; norms and maximum are over the sample."""

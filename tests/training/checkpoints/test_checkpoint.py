@@ -19,9 +19,9 @@ from training.checkpoints.weights import fill_network
 from training.engine.distributed import random_state, restore_random_state
 
 
-def save(run: Path, step: int, keep: int = 3, **more: Any) -> Path:
+def save(run: Path, step: int, keep: int = 3, recipe: dict[str, Any] | None = None, **more: Any) -> Path:
     values = {"layer.weight": torch.full((2, 3), float(step))}
-    about = {"step": step, "recipe": {"batch": step}, "dataset": "uuid", "dataset_sha256": "abc"}
+    about = {"step": step, "recipe": recipe or {"batch": step}, "dataset": "uuid", "dataset_sha256": "abc"}
     return save_checkpoint(run, about=about, weights=values, state={"optimiser": {"step": step}}, keep=keep, **more)
 
 
@@ -258,6 +258,14 @@ def test_exported_weights_load_without_the_optimiser(tmp_path: Path) -> None:
     flip_bit(folder / "weights.safetensors")
     with pytest.raises(CheckpointError, match="damaged"):
         require_checkpoint(folder)
+
+
+def test_exported_weights_do_not_tell_where_the_first_ones_lay(tmp_path: Path) -> None:
+    recipe = {"start_from": "/home/somebody/secret/first-run"}
+    save(tmp_path / "run", 7, recipe=recipe)
+    export_weights(require_checkpoint(tmp_path / "run"), tmp_path / "weights")
+    assert require_checkpoint(tmp_path / "weights").recipe == {"start_from": "first-run"}
+    assert all(b"secret" not in path.read_bytes() for path in (tmp_path / "weights").iterdir())
 
 
 def test_weights_too_large_for_half_precision_are_refused(tmp_path: Path) -> None:
