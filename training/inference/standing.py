@@ -44,9 +44,10 @@ _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's ow
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
+_SIDES = 6  # of a box: directions along the axes
 _QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
 _TURNS = 3
-_TILTS = np.radians([16.0, 8.0, 4.0, 0.0])  # about any axis, tried after the best of all ways is known
+_TILTS = np.radians([16.0, 8.0, 4.0])  # about any axis, tried after the best of all ways is known
 _ANGLES = np.radians(np.arange(0.0, 360.0, 30.0))
 
 
@@ -79,7 +80,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
-    the best. Another way is taken where it is clearly better understood.
+    the best. Another way is taken where it is clearly better understood, one between the mesh' axes where it is clearly
+    better than all along them.
 
     Parameters
     ----------
@@ -104,11 +106,12 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     if best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
         return faced(best)
-    ways = [_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES]
+    every = seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES])
+    along_axes, best = (min(some, key=lambda way: way.misfit) for some in (every[: _SIDES * len(_ANGLES)], every))
     for size in _TILTS:
-        best = min(seen(ways), key=lambda way: way.misfit)
-        ways = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)] + [best.way]
-    found = faced(best)
+        turned = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
+        best = min(seen([best.way, *turned]), key=lambda way: way.misfit)
+    found = faced(along_axes if along_axes.misfit <= _CLEARLY * best.misfit else best)
     return found if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
 
 
@@ -132,8 +135,9 @@ class _Seen(NamedTuple):
 
 
 def _upward() -> list[NDArray[np.float64]]:
-    """The least turns [3, 3] that bring each of 26 directions upward: along the axes, and midway between them."""
+    """The least turns [3, 3] that bring each of 26 directions upward: six along the axes, then midway between them."""
     directions = [np.array(signs) for signs in product((0.0, 1.0, -1.0), repeat=3) if any(signs)]
+    directions.sort(key=lambda direction: float(np.abs(direction).sum()))
     return [Rotation.align_vectors([[0, 1, 0]], [each])[0].as_matrix() for each in directions]
 
 

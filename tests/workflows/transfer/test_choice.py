@@ -115,11 +115,7 @@ def test_the_weights_that_come_along_tell_people_from_animals(
     monkeypatch.chdir(tmp_path)
     transfer(tmp_path, "a.obj", "b.obj")
     assert "by the weights human" in capsys.readouterr().out
-    for source, target in (("deer", "fox"), ("donkey", "horse_white"), ("wolf", "cow")):
-        transfer(tmp_path, animals[source], animals[target])
-        assert "by the weights animals" in capsys.readouterr().out, (source, target)
-    for first, second in (("a.obj", animals["deer"]), (animals["donkey"], "b.obj")):
-        with pytest.raises(MeshError, match="is an animal on four legs"):
-            transfer(tmp_path, first, second)
-    transfer(tmp_path, "a.obj", animals["deer"], "--force")
+    transfer(tmp_path, animals["deer"], animals["fox"])
     assert "by the weights animals" in capsys.readouterr().out
+    with pytest.raises(MeshError, match=r"a\.obj is a person and .* is an animal on four legs"):
+        transfer(tmp_path, "a.obj", animals["deer"])
