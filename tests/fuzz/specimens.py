@@ -108,7 +108,7 @@ def _make_workflow(folder: Path, specimens: Specimens) -> None:
     journal.close()
     (root / "run" / "figures").mkdir()
     (root / "run" / "figures" / "curve.png").write_bytes(b"png")
-    write_rows([Row("DSFFNet", "seen", 3, 1, 2, 3, 4, *[0.5] * 7)] * 3, root / "run" / "rows.csv")
+    write_rows([Row("DSFFNet", "seen", 3, 1, 2, 3, 4, *[0.5] * 8)] * 3, root / "run" / "rows.csv")
     about_data = {"name": "leg.zarr", "url": "leg.zarr", "manifest_sha256": "0" * 64}
     update_record(root / "run", artifacts=["figures", "rows.csv"], metrics={"final": 0.5}, dataset=about_data)
     end_record(root / "run", "FINISHED")

@@ -84,14 +84,22 @@ DATASET_LIMITS = """\
 
 MODEL_USE = """\
 Transfers the pose of a source mesh to a target mesh, without skeleton or correspondence; the two may differ in
-vertices, faces, size and place. Inputs stand as the training data does: **Y up, facing +Z**. Each mesh is centred on
-its bounding box and divided by half the longest edge of it before the network sees it."""
+vertices, faces, size and place. The network sees them stand as the training data does, **Y up, facing +Z**, each mesh
+centred on its bounding box and divided by half the longest edge of it."""
 
-MODEL_LIMITS = """\
+SEES_ALL_VERTICES = """\
 - Orientation matters: nothing in the network makes it indifferent to rotation, and a mesh that lies down or faces
   elsewhere than the training data is outside of what it has seen. Turn it first.
 - Trained on meshes of {vertices} vertices. Others run, but features are normalised over a mesh's vertices, so another
-  density, or one that is uneven over the body, changes the result.
+  density, or one that is uneven over the body, changes the result."""
+
+READS_PARTS = """\
+- A transfer turns meshes upright first, by how well this network understands them. It errs by some degrees where a body
+  stands between the axes of its file; called by itself, the network knows bodies that stand upright only.
+- Trained on meshes of {vertices} vertices, of which it reads an even sample: other densities matter little.
+- It poses by one skeleton, and what bends where that has no joint stays stiff."""
+
+MODEL_LIMITS = """\
 - Trained on the bodies of its dataset card; people in clothes, other species and unusual proportions are outside of
   it where those bodies have none.
 - One mesh of one component is expected; floating parts and bases count as body in the bounding box.
@@ -101,9 +109,6 @@ NETWORK_LIMITS = {
     "npt origin": "\n- Source and target must have equally many vertices: they are paired by number.",
     "corenet3d": "\n- Time grows with source vertices times target vertices (memory does not), and the order of "
     "target vertices matters: its generator convolves along it.",
-    "parts": "\n- It poses by one skeleton, and what bends where that has no joint stays stiff.\n"
-    "- Of the above it minds other densities least, as it reads an even sample of the vertices; and a transfer turns "
-    "meshes upright first, by how well this network understands them.",
 }
 
 

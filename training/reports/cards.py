@@ -19,7 +19,7 @@ from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row
 from training.evaluation.run_curves import run_curve
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
 from training.networks import network_from
-from training.recipes.training import NptRecipe, TrainingRecipe
+from training.recipes.training import NptRecipe, PartsRecipe, TrainingRecipe
 from training.reports.blocks import Block, Code, Facts, Picture, Section, shown
 from training.reports.card_texts import (
     DATASET_LIMITS,
@@ -29,6 +29,8 @@ from training.reports.card_texts import (
     NETWORK_LIMITS,
     NETWORKS,
     POSES,
+    READS_PARTS,
+    SEES_ALL_VERTICES,
     as_yaml,
     family_texts,
     name_of,
@@ -64,7 +66,9 @@ def model_card(run: Path, dataset: Dataset, rows: Sequence[Row] | None = None) -
     body: list[Block] = [Facts(_model_facts(checkpoint, recipe, dataset, home)), _changed(recipe)]
     body.append(Code(as_yaml({"training": recipe.model_dump(mode="json")}), folded="The whole training recipe"))
     body += _results(list(rows or ()))
-    limits = MODEL_LIMITS.format(vertices=span(vertex_counts(dataset, "training")), network=_network_limits(recipe))
+    how_it_sees = READS_PARTS if isinstance(recipe.network, PartsRecipe) else SEES_ALL_VERTICES
+    limits = how_it_sees.format(vertices=span(vertex_counts(dataset, "training")))
+    limits += "\n" + MODEL_LIMITS.format(network=_network_limits(recipe))
     licences = ", ".join(dict.fromkeys(plain(asset["licence"]) for asset in dataset.attributes["body"]["assets"]))
     body += [
         Text(f"### Intended use\n\n{MODEL_USE}\n\n### Limits\n\n{limits}{_worse_than_nothing(list(rows or ()))}"),

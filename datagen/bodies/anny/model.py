@@ -19,7 +19,6 @@ import scipy.sparse
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from datagen.bodies.anny.first_load import read_in_bulk
 from datagen.bodies.anny.identities import Population, draw_local_changes, draw_uniform
 from datagen.bodies.anny.rigs import Bones, t_pose_corrections
 from datagen.bodies.anny.shape import AnnyShape
@@ -123,6 +122,8 @@ def _load_anny(recipe: AnnyBody) -> Any:
         warnings.simplefilter("ignore")  # torch's, about sparse tensors in Anny
         import anny
         from anny.paths import get_anny_cache_path
+
+        from datagen.bodies.anny.first_load import read_in_bulk  # it brings torch, which the command line waits with
 
         cache = Path(get_anny_cache_path())
         try:

@@ -276,7 +276,7 @@ def test_models_come_from_a_store_that_nobody_named_only_where_it_lies_whole_in_
     client.create_registered_model("dsffnet")
     client.create_model_version("dsffnet", (tmp_path / "private").as_uri())
     monkeypatch.chdir(tmp_path)
-    asked = Namespace(model="models:/dsffnet/1", tracking_uri=None)
+    asked = Namespace(model="models:/dsffnet/1", tracking_uri=None, force=False)
     with pytest.raises(RegistryError, match=r"notes artifacts at .*private', outside its folder.*name the store"):
         transfer.weights_of(asked).__enter__()
 
