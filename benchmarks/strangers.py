@@ -129,7 +129,7 @@ def pairs_of_people() -> list[tuple[Stranger, Stranger]]:
         (poses[13], of(adult, "noise of 2 %", disturbed(disturbances.add_noise, 0.02))),
         (poses[14], of(adult, "a tenth missing", disturbed(disturbances.remove_patch, 0.1))),
         (poses[15], of(adult, "clustered", disturbed(disturbances.merge_cells, 0.08))),
-        (poses[16], of(adult, "stylised: head and feet large", stylised)),
+        (poses[16], of(soma, "stylised: head and feet large", stylised)),
         (of(poses[17], "as wide as high", scaled(2.0, 1.0, 1.5)), adult),
         (poses[18], of(dense, "squashed to two thirds", scaled(1.0, 0.66, 1.0))),
         (poses[19], of(adult, "upside down", lambda mesh: Mesh(mesh.vertices * [1, -1, -1], mesh.faces))),
