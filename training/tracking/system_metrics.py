@@ -111,9 +111,10 @@ def _named(rows: list[tuple[float | None, ...]]) -> dict[str, float]:
 def _sample(path: Path, stop: threading.Event, every: float) -> None:
     try:
         with contextlib.closing(Journal(path)) as journal:
-            load, step = MachineLoad(path.parent), journal.next_step
-            while not stop.wait(every):
-                journal.write(step, load.read())
+            load, step, is_over = MachineLoad(path.parent), journal.next_step, False
+            while not is_over:
+                is_over = stop.wait(every)
+                journal.write(step, load.read())  # once more at the end, so that what takes seconds has its line
                 step += 1
     except (DsffnetError, OSError, psutil.Error) as error:
         log.warning("the load of this machine is no longer noted in %s: %s", path, error)
