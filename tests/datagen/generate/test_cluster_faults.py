@@ -31,7 +31,7 @@ from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import train_model
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(300)]
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def many_shards() -> DatasetRecipe:
@@ -66,7 +66,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 _DRIVER = """
 import os, sys, ray
 from datagen.generate import generate, ray_runner
-from tests.datagen.test_cluster_faults import many_shards
+from tests.datagen.generate.test_cluster_faults import many_shards
 ray.init(address=os.environ.get("FAULT_ADDRESS", "local"), num_cpus=None if "FAULT_ADDRESS" in os.environ else 2,
          include_dashboard=False, log_to_driver=False)
 generate(many_shards(), sys.argv[1], run=ray_runner)

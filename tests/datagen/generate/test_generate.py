@@ -86,7 +86,7 @@ def test_sigkill_while_writing(dataset: str, tmp_path: Path) -> None:
         "generate(tiny_dataset(), sys.argv[1])"
     )
     for shards_before_kill in (1, 3, 6):
-        process = subprocess.Popen([sys.executable, "-c", code, str(url)], cwd=Path(__file__).parents[2])
+        process = subprocess.Popen([sys.executable, "-c", code, str(url)], cwd=Path(__file__).parents[3])
         while process.poll() is None and len(list(url.rglob("vertices/c/*/*/0/0"))) < shards_before_kill:
             time.sleep(0.002)
         assert process.poll() is None, "it ended before it could be killed"

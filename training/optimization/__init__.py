@@ -1,0 +1,1 @@
+"""Optimisers, learning rates over a run, and averaged weights."""
