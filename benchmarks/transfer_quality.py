@@ -40,7 +40,8 @@ def refined(transfer: PoseTransfer, dataset: Dataset, triple: list[int]) -> list
     source_identity, source_pose, target_identity, target_pose = triple
     faces, truth = dataset.faces(target_identity), dataset.vertices(target_identity, source_pose).astype(np.float64)
     target = Mesh(dataset.vertices(target_identity, target_pose).astype(np.float64), faces)
-    output = transfer.vertices(dataset.vertices(source_identity, source_pose), target.vertices)
+    source = Mesh(dataset.vertices(source_identity, source_pose).astype(np.float64), dataset.faces(source_identity))
+    output = transfer.unplaced(source, target)
     scale, right = scale_of(target, output), torch.from_numpy(bounding_box(truth).normalise(truth))[None]
     edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
     found = []

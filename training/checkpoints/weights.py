@@ -161,7 +161,8 @@ def fill_network(network: nn.Module, weights: Mapping[str, Tensor], *, where: st
     if faults:
         raise CheckpointError(
             f"{where} holds weights of another network than this {type(network).__name__}: {'; '.join(faults)}. "
-            "Name a checkpoint of this network, or build the network by the checkpoint's own recipe"
+            "Name a checkpoint of this network, build the network by the checkpoint's own recipe, or train "
+            "weights of an earlier version anew"
         )
     network.load_state_dict(dict(weights))
 

@@ -60,6 +60,8 @@ class Augmentation:
         if recipe.subset:
             batch = self._subset(batch, recipe.subset, random)
         batch = self._supervise(triples, batch)
+        if batch.surfaces:
+            batch = _without_some_surfaces(batch, random)
         if recipe.proportions and isinstance(self._network, PartsRecipe):
             batch = of_other_proportions(batch, recipe.proportions, self._network.joints, random)
         if recipe.source_noise:
@@ -168,6 +170,14 @@ def _cut(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
         rows.append(far[: max(1, round(count * (1 - share)))].sort().values)
     batch = _of_rows(batch, rows)
     return replace(batch, source=_boxed(batch.source, batch.source_counts))
+
+
+def _without_some_surfaces(batch: Batch, random: Sequence[torch.Generator]) -> Batch:
+    """A quarter of the sources, by chance, as points are: it is not told what is near along their surfaces."""
+    assert batch.surfaces is not None
+    source, target = batch.surfaces
+    unknown = torch.stack([torch.rand((), generator=own, device=batch.source.device) < 0.25 for own in random])
+    return replace(batch, surfaces=(source._replace(near=source.near | unknown[:, None, None]), target))
 
 
 def _noisy(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.common.errors import DatasetError
+from datagen.mesh.geometry import edges_of
 from datagen.store import Dataset
 from training.data.triples import Triples
 from training.data.vertex_layout import normalised
+from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.edge_incidence import INCIDENCES, incidence_of, join_incidences
 from training.objectives.losses import PackedEdges, loss_edges
 from training.objectives.parts import Posed
@@ -38,6 +40,8 @@ class Batch:
         ``[b, n]``, numbers of the vertices that were taken of each mesh; None: all.
     posed
         Of a network that learns from rigs: how the sources are posed, and the targets.
+    surfaces
+        What is near along the surfaces of the sources, and of the targets, for a network that asks; None: not known.
     """
 
     source: Tensor
@@ -49,6 +53,7 @@ class Batch:
     source_rows: Tensor | None = None
     target_rows: Tensor | None = None
     posed: tuple[Posed, Posed] | None = None
+    surfaces: tuple[Surface, Surface] | None = None
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
         """The same on another device."""
@@ -59,8 +64,9 @@ class Batch:
             rows if rows is None else rows.to(device) for rows in (self.source_rows, self.target_rows)
         )
         posed = self.posed and (self.posed[0].to(device), self.posed[1].to(device))
+        surfaces = self.surfaces and (self.surfaces[0].to(device), self.surfaces[1].to(device))
         counts = self.source_counts, self.target_counts
-        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed)
+        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed, surfaces)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -78,7 +84,9 @@ class Batch:
             edges = edges.part(start, stop, rows=self.target.shape[1])
         at = slice(start, stop)
         source_counts, target_counts = (counts and counts[at] for counts in (self.source_counts, self.target_counts))
-        return Batch(self.source[at], self.target[at], self.truth[at], edges, source_counts, target_counts)
+        surfaces = self.surfaces and (self.surfaces[0].of(at), self.surfaces[1].of(at))
+        meshes = self.source[at], self.target[at], self.truth[at]
+        return Batch(*meshes, edges, source_counts, target_counts, surfaces=surfaces)
 
 
 class EdgeTable:
@@ -130,7 +138,7 @@ def counts_of(counts: NDArray[np.integer]) -> Counts | None:
     return None if (counts == counts[0]).all() else tuple(int(count) for count in counts)
 
 
-def read_batch(dataset: Dataset, triples: Triples, *, padded: bool = False) -> Batch:
+def read_batch(dataset: Dataset, triples: Triples, *, padded: bool = False, surfaces: bool = False) -> Batch:
     """The normalised meshes of rows (source identity, source pose, target identity, target pose), and only those.
 
     For a few triples of a large dataset; :func:`training.data.vertex_bank.open_bank` is for many.
@@ -139,6 +147,8 @@ def read_batch(dataset: Dataset, triples: Triples, *, padded: bool = False) -> B
     ----------
     padded
         Pad meshes of different counts; the caller then minds ``source_counts`` and ``target_counts``.
+    surfaces
+        Find what is near along them, for a network that takes it (`training.networks.NETWORKS`): milliseconds a mesh.
 
     Raises
     ------
@@ -151,7 +161,17 @@ def read_batch(dataset: Dataset, triples: Triples, *, padded: bool = False) -> B
     truth, _ = _read(dataset, target_identity, source_pose, padded=padded)
     table = EdgeTable(dataset, np.unique(target_identity).tolist(), device="cpu")
     edges = table.of(target_identity, rows=target.shape[1])
-    return Batch(source, target, truth, edges, source_counts, target_counts)
+    batch = Batch(source, target, truth, edges, source_counts, target_counts)
+    if not surfaces:
+        return batch
+    found = _surfaces(dataset, source_identity, source), _surfaces(dataset, target_identity, target)
+    return replace(batch, surfaces=found)
+
+
+def _surfaces(dataset: Dataset, identities: NDArray[np.integer], meshes: Tensor) -> Surface:
+    edges = {int(identity): edges_of(dataset.faces(int(identity))) for identity in np.unique(identities)}
+    pairs = zip(identities.tolist(), meshes, strict=True)
+    return joined([surface_of(mesh[: dataset.vertex_count(own)].numpy(), edges[own]) for own, mesh in pairs])
 
 
 def _read(

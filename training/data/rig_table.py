@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.common.errors import RecipeError
+from datagen.mesh.geometry import edges_of
 from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
 from datagen.store import Dataset
 from training.data.batch import Batch
@@ -19,6 +20,7 @@ from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers import rigid_parts
 from training.networks.layers.rigid_parts import ancestors, moved_joints
+from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.parts import Posed
 
 _POSES = 8  # of an identity, that its body at rest is found from
@@ -65,17 +67,20 @@ class RigTable:
         self._world = torch.from_numpy(world[:, chosen].astype(np.float32)).to(device)
         self._device, self._row = torch.device(device), dict[int, int]()
         weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
+        surfaces = list[Surface]()
         kinds, known = list[int](), dict[bytes, int]()
         for identity in identities:
             its_weights, its_rest, its_joints = self._of_identity(int(identity))
             kind = known.setdefault(its_weights.tobytes(), len(known))
             if kind == len(weights):
                 weights.append(torch.from_numpy(its_weights).to(device))
+                surfaces.append(surface_of(its_rest, edges_of(dataset.faces(int(identity)))))
             kinds.append(kind)
             rest.append(torch.from_numpy(its_rest).to(device))
             at.append(its_joints)
             self._row[int(identity)] = len(rest) - 1
         self._weights, self._rest, self._kinds = weights, rest, kinds
+        self._surfaces = joined(surfaces).to(device)
         self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
         self._joints = torch.from_numpy(np.stack(at)).to(device)
 
@@ -83,7 +88,17 @@ class RigTable:
         """The batch of rows (source identity, source pose, target identity, target pose), with what the rigs say."""
         sources = self._of(triples[:, 0], triples[:, 1], batch.source, batch.source_rows)
         targets = self._of(triples[:, 2], triples[:, 3], batch.target, batch.target_rows)
-        return replace(batch, posed=(sources, targets))
+        surfaces = (
+            self._surface(triples[:, 0], batch.source, batch.source_rows),
+            self._surface(triples[:, 2], batch.target, batch.target_rows),
+        )
+        return replace(batch, posed=(sources, targets), surfaces=surfaces)
+
+    def _surface(self, identities: NDArray[np.integer], vertices: Tensor, rows: Tensor | None) -> Surface:
+        """The surfaces of meshes of these identities; a pose does not change what is near along them."""
+        kinds = sent(torch.tensor([self._kinds[self._row[int(identity)]] for identity in identities]), self._device)
+        cells, near = (each.index_select(0, kinds) for each in self._surfaces)
+        return Surface(cells[:, : vertices.shape[1]], near) if rows is None else Surface(cells, near).at(rows)
 
     def _of(
         self, identities: NDArray[np.integer], poses: NDArray[np.integer], vertices: Tensor, rows: Tensor | None

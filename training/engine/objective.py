@@ -66,7 +66,12 @@ class PartsObjective(nn.Module):
         """Return the losses of a batch that a :class:`training.data.rig_table.RigTable` was asked about."""
         assert batch.posed is not None
         loss, parts = parts_loss(
-            self.network, source=batch.source, target=batch.target, truth=batch.truth, posed=batch.posed
+            self.network,
+            source=batch.source,
+            target=batch.target,
+            truth=batch.truth,
+            posed=batch.posed,
+            surfaces=batch.surfaces,
         )
         return {**parts, "total": loss}
 

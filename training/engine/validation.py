@@ -24,7 +24,7 @@ from training.engine.state import Job, State
 from training.engine.train_step import Learner
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
-from training.recipes.training import TrainingRecipe
+from training.recipes.training import PartsRecipe, TrainingRecipe
 from training.tracking.journal import Journal, coefficient_metrics
 from training.tracking.progress import Progress
 from training.tracking.system_metrics import sampling
@@ -48,7 +48,8 @@ class Validation:
         for pose_type in ("seen", "unseen"):
             triples = dataset.evaluation_triples(pose_type)[: recipe.evaluate_triples]
             if len(triples):
-                self._batches[pose_type] = read_batch(dataset, triples, padded=True).in_dtype(dtype).to(device)
+                batch = read_batch(dataset, triples, padded=True, surfaces=isinstance(recipe.network, PartsRecipe))
+                self._batches[pose_type] = batch.in_dtype(dtype).to(device)
                 self._faces = _common_faces(dataset, triples)
         if recipe.picture_every and self._faces is None:
             log.info("no pictures while training: the evaluation triples are none, or of several topologies")

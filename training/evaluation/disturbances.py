@@ -2,7 +2,7 @@
 
 Every disturbance is a pure function ``(mesh, amount, seed) -> mesh``: the vertices [v, 3] in any unit, Y up, the same
 seed the same bits; more of the amount is more of the same draw. The mesh that was given is never changed. Amount 0
-gives it back as it was. Networks see vertices only, so a disturbance may return no faces at all.
+gives it back as it was. The papers' networks see vertices only, so a disturbance may return no faces at all.
 """
 
 from collections.abc import Callable

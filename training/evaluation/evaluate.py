@@ -191,7 +191,11 @@ def _resolved(method: Method, dataset: Dataset, recipe: EvaluationRecipe) -> Con
         for number, triple in enumerate(evaluation_list(dataset, recipe, pose_type)):
             counts = dataset.vertex_count(int(triple[0])), dataset.vertex_count(int(triple[2]))
             require_pairable(method.name, network, *counts, where=f"{pose_type} triple {number} of {dataset.url}")
-    return Contender(method.name, str(checkpoint.path), fingerprint_of(checkpoint))
+    if not method.projected_by:
+        return Contender(method.name, str(checkpoint.path), "", fingerprint_of(checkpoint))
+    parts = require_checkpoint(Path(method.projected_by), "result", weights_only=True)
+    weights = fingerprint_of(checkpoint) + fingerprint_of(parts)
+    return Contender(method.name, str(checkpoint.path), str(parts.path), weights)
 
 
 def fingerprint_of(checkpoint: Checkpoint) -> str:

@@ -126,7 +126,7 @@ def takes(method: LoadedMethod, cases: Sequence[Case]) -> bool:
 
 
 def _scores(method: LoadedMethod, cases: Sequence[Case]) -> list[Score]:
-    pairs = ((case.source.vertices, case.target.vertices) for case in cases)
+    pairs = ((case.source, case.target) for case in cases)
     return [case.score(its) for case, its in zip(cases, transfer_each(method.network, pairs), strict=True)]
 
 

@@ -18,12 +18,13 @@ from torch import Tensor, nn
 
 from datagen.common.resources import memory_errors
 from datagen.grid import PoseType
-from datagen.mesh.geometry import bounding_box, edges_of
+from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
 from training.evaluation.paper_numbers import method_name, needs_equal_counts
 from training.evaluation.results import Row, Score
-from training.inference.predict import load_trained, predict
+from training.inference.predict import load_trained, predict, surfaces_of, takes_surfaces
+from training.inference.projection import OntoParts
 from training.objectives import metrics
 from training.recipes.training import EvaluationRecipe
 
@@ -36,11 +37,13 @@ class Method:
     """A network to measure: its name in tables, and its weights.
 
     ``weights``: a run, a checkpoint's folder or a file of weights
-    (see ``training.checkpoints.checkpoint.require_checkpoint``).
+    (see ``training.checkpoints.checkpoint.require_checkpoint``). ``projected_by``: weights of a parts network, onto
+    whose parts its outputs are projected; "" for none.
     """
 
     name: str
     weights: str
+    projected_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,8 @@ def _measured(
     contenders: Sequence[Contender], dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType, start: int
 ) -> list[Row]:
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    batch, groups = read_batch(dataset, triples, padded=True), _groups(dataset, triples)
+    told = any(takes_surfaces(_network_of(its)) for its in contenders if its.name not in NO_OPS)
+    batch, groups = read_batch(dataset, triples, padded=True, surfaces=told), _groups(dataset, triples)
     return [
         Row(contender.name, pose_type, start + place, *map(int, triple), *astuple(score))
         for contender in contenders
@@ -81,13 +85,18 @@ def _measured(
 def _output(contender: Contender, batch: Batch) -> Tensor:
     if contender.name in NO_OPS:
         return batch.target if contender.name == NO_OPS[0] else batch.source
-    return predict(_network(contender.weights, contender.sha256), batch)
+    return predict(_network_of(contender), batch)
+
+
+def _network_of(contender: Contender) -> nn.Module:
+    return _network(contender.weights, contender.projected_by, contender.sha256)
 
 
 @lru_cache(maxsize=8)
-def _network(weights: str, sha256: str) -> nn.Module:
+def _network(weights: str, projected_by: str, sha256: str) -> nn.Module:
     """The network of weights, once a process; ``sha256`` tells weights apart that were written to one place."""
-    return load_trained(Path(weights))[0]
+    network = load_trained(Path(weights))[0]
+    return OntoParts.of(network, Path(projected_by)) if projected_by else network
 
 
 @dataclass(frozen=True)
@@ -216,22 +225,21 @@ def normalised(vertices: Vertices) -> NDArray[np.float32]:
 
 
 @torch.no_grad()
-def transfer_each(network: nn.Module, pairs: Iterable[tuple[Vertices, Vertices]]) -> Iterator[NDArray[np.float64]]:
-    """Outputs [m, 3] in the normalised box for pairs of source [n, 3] and target [m, 3] in any unit, in their order.
+def transfer_each(network: nn.Module, pairs: Iterable[tuple[Mesh, Mesh]]) -> Iterator[NDArray[np.float64]]:
+    """Outputs [m, 3] in the normalised box for pairs of source and target in any unit, in their order.
 
     Pairs of equal counts that follow each other go through the network together, as far as memory stays small.
     """
-    for _, run in groupby(pairs, key=lambda pair: (len(pair[0]), len(pair[1]))):
-        alike = list(run)
-        at_once = max(1, _POINTS_AT_ONCE // (len(alike[0][0]) + len(alike[0][1])))
+    for counts, run in groupby(pairs, key=lambda pair: (len(pair[0].vertices), len(pair[1].vertices))):
+        alike, at_once = list(run), max(1, _POINTS_AT_ONCE // sum(counts))
         for start in range(0, len(alike), at_once):
-            part = alike[start : start + at_once]
-            output = network(source=_stacked([source for source, _ in part]), target=_stacked([its for _, its in part]))
-            yield from output.double().numpy()
+            sources, targets = zip(*alike[start : start + at_once], strict=True)
+            told = surfaces_of(network, sources=sources, targets=targets)
+            yield from network(source=_stacked(sources), target=_stacked(targets), **told).double().numpy()
 
 
-def _stacked(meshes: Sequence[Vertices]) -> Tensor:
-    return torch.from_numpy(np.stack([normalised(mesh) for mesh in meshes]))
+def _stacked(meshes: Sequence[Mesh]) -> Tensor:
+    return torch.from_numpy(np.stack([normalised(mesh.vertices) for mesh in meshes]))
 
 
 def score(

@@ -156,10 +156,10 @@ def steps(
 def _measure(
     method: LoadedMethod, cases: Sequence[Case], disturbance: Disturbance, amount: float, emd_points: int | None
 ) -> list[RobustnessRow]:
-    sources = [disturbed(case, disturbance, amount).vertices for case in cases]
-    outputs = transfer_each(method.network, zip(sources, (case.target.vertices for case in cases), strict=True))
+    sources = [disturbed(case, disturbance, amount) for case in cases]
+    outputs = transfer_each(method.network, zip(sources, (case.target for case in cases), strict=True))
     scores = [case.score(output, emd_points) for case, output in zip(cases, outputs, strict=True)]
-    return _rows((method.name, disturbance.name, amount), cases, [len(source) for source in sources], scores)
+    return _rows((method.name, disturbance.name, amount), cases, [len(source.vertices) for source in sources], scores)
 
 
 def _rows(

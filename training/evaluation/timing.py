@@ -134,7 +134,9 @@ def _first_pair(batch: Batch) -> Batch:
     """The first pair of a batch, without padding."""
     pair = batch.part(0, 1)
     source, target = (_unpadded(mesh, counts) for mesh, counts in _meshes(pair))
-    return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64))
+    told = pair.surfaces
+    surfaces = told and (told[0].of(slice(1), source.shape[1]), told[1].of(slice(1), target.shape[1]))
+    return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64), surfaces=surfaces)
 
 
 def _meshes(pair: Batch) -> list[tuple[Tensor, tuple[int, ...] | None]]:

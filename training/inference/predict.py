@@ -1,16 +1,19 @@
 """Networks from recipes and checkpoints, and running them over meshes."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
+from datagen.mesh.geometry import Mesh, edges_of
 from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.weights import fill_network
 from training.networks import network_from
 from training.networks.execution import GraphedTransfer
+from training.networks.layers.surface import Surface, joined, surface_of
 from training.recipes.training import TrainingRecipe
 
 if TYPE_CHECKING:
@@ -58,12 +61,36 @@ def predict(network: nn.Module, batch: "Batch") -> Tensor:
     if batch.source_counts or batch.target_counts:
         return torch.cat([_predict_mixed(network, part) for part in parts])
     transfer = GraphedTransfer(network)
-    return torch.cat([transfer(source=part.source, target=part.target) for part in parts])
+    return torch.cat([transfer(source=part.source, target=part.target, **_told(network, part)) for part in parts])
+
+
+def _told(network: nn.Module, batch: "Batch") -> dict[str, Surface]:
+    """What a network takes beside vertices."""
+    if not takes_surfaces(network) or batch.surfaces is None:
+        return {}
+    return {"source_surface": batch.surfaces[0], "target_surface": batch.surfaces[1]}
+
+
+def surfaces_of(network: nn.Module, *, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> dict[str, Surface]:
+    """What a network takes beside the vertices of meshes: keyword arguments, none for the networks of the papers."""
+    if not takes_surfaces(network):
+        return {}
+    device = next(network.parameters()).device
+    return {"source_surface": _surface(sources).to(device), "target_surface": _surface(targets).to(device)}
+
+
+def takes_surfaces(network: nn.Module) -> bool:
+    """Whether a network is told what is near along the surfaces of its meshes (`training.networks.NETWORKS`)."""
+    return bool(getattr(network, "takes_surfaces", False))
+
+
+def _surface(meshes: Sequence[Mesh]) -> Surface:
+    return joined([surface_of(mesh.vertices, edges_of(mesh.faces)) for mesh in meshes])
 
 
 def _predict_mixed(network: nn.Module, batch: "Batch") -> Tensor:
     from training.networks.padded_batches import MixedCounts
 
     counts = {"source_counts": batch.source_counts, "target_counts": batch.target_counts}
-    found: Tensor = MixedCounts(network)(source=batch.source, target=batch.target, **counts)
+    found: Tensor = MixedCounts(network)(source=batch.source, target=batch.target, **counts, **_told(network, batch))
     return found

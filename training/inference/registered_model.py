@@ -34,6 +34,8 @@ _DEFAULTS: dict[str, Any] = {"up": "Y", "front": "Z", "align": False, "refine": 
 class PoseTransferModel(PythonModel):  # type: ignore[misc]
     """Source vertices [n, 3], target vertices [m, 3] and target faces [f, 3] in; posed vertices [m, 3] out.
 
+    Unwrapped, it takes the source's faces, too (``source_faces``), which the parts network makes use of.
+
     ``params`` are options of ``dsffnet transfer``: ``up`` and ``front`` (of both meshes, or ``source,target``),
     ``align`` (each mesh's axes are found) and ``refine`` (weight of the target's edges; 0, the default, for none).
     """
@@ -85,11 +87,10 @@ def _mesh(model_input: Any, role: str) -> Mesh:
 
 
 def _source(model_input: Any) -> Mesh:
-    """The source; of a pose no faces are asked, so that one that points nowhere wrong stands for them."""
-    given = model_input["source"]
-    if isinstance(given, str | Path):
-        return read_mesh_file(given).mesh
-    return check_mesh(Mesh(np.asarray(given, np.float64), np.zeros((1, 3), np.int64)), name="source")
+    """The source; of a pose no faces are asked, so that one that joins nothing stands for them where none are given."""
+    if isinstance(model_input["source"], str | Path) or "source_faces" in model_input:
+        return _mesh(model_input, "source")
+    return _mesh({**model_input, "source_faces": np.zeros((1, 3), np.int64)}, "source")
 
 
 def download_weights(uri: str, tracking_uri: str, folder: Path, *, own: bool = False) -> Path:

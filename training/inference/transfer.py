@@ -20,9 +20,11 @@ from torch import nn
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
 from training.inference.orientation import UPRIGHT, Axes
-from training.inference.predict import load_trained
+from training.inference.predict import load_trained, surfaces_of
+from training.inference.projection import OntoParts
 from training.inference.standing import Standing, facing, misfit, standing, understanding_of
 from training.networks.execution import GraphedTransfer, Precision
+from training.networks.layers.surface import Surface
 from training.networks.parts import Parts
 from training.objectives.metrics import point_mesh_distance
 
@@ -44,19 +46,30 @@ class PoseTransfer:
     """
 
     def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:
-        """Use a network where it is; on a GPU shapes that come again are replayed (see :class:`GraphedTransfer`)."""
+        """Use a network where it is.
+
+        On a GPU shapes that come again are replayed (see :class:`GraphedTransfer`), but for networks that are told of
+        surfaces.
+        """
         self._transfer = GraphedTransfer(network.eval(), precision=precision)
+        self._bare, self._parts = self._transfer, network if isinstance(network, Parts) else None
+        if isinstance(network, OntoParts):
+            self._bare, self._parts = GraphedTransfer(network.network, precision=precision), network.parts
         self._network = network
         self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
 
     @classmethod
-    def from_run(cls, run: str | Path, *, device: torch.device | str | None = None) -> "PoseTransfer":
+    def from_run(
+        cls, run: str | Path, *, device: torch.device | str | None = None, project: Path | None = None
+    ) -> "PoseTransfer":
         """The network of a run folder, with the weights that are its result (CheckpointError where there are none).
 
-        It runs on ``device``; by default on a GPU where there is one.
+        It runs on ``device``; by default on a GPU where there is one. With ``project``, weights of a parts network, its
+        outputs are projected onto rigid parts (:class:`training.inference.projection.OntoParts`).
         """
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        return cls(load_trained(Path(run))[0].to(device))
+        network = load_trained(Path(run))[0].to(device)
+        return cls(OntoParts.of(network, project) if project else network)
 
     def __call__(
         self,
@@ -143,16 +156,20 @@ class PoseTransfer:
             finished = refinement(vertices) if refinement else vertices
             yield Mesh(target_axes.restored(finished), target.faces)
 
-    def pose(self, source: Floats, target: Mesh) -> Mesh:
-        """As calling, from the source's vertices [n, 3] alone; meshes are taken to be usable."""
-        return Mesh(placed(target, self.vertices(source, target.vertices)), target.faces)
+    def unplaced(self, source: Mesh, target: Mesh) -> NDArray[np.float64]:
+        """Posed vertices [n_target, 3] in the normalised box, of meshes that are usable and stand upright."""
+        surfaces = surfaces_of(self._network, sources=[source], targets=[target])
+        return self.vertices(source.vertices, target.vertices, **surfaces)
 
     @torch.no_grad()
-    def vertices(self, source: Floats, target: Floats) -> NDArray[np.float64]:
-        """Posed vertices [n_target, 3] in the normalised box, from vertices [n_source, 3] and [n_target, 3]."""
+    def vertices(self, source: Floats, target: Floats, **surfaces: Surface) -> NDArray[np.float64]:
+        """Posed vertices [n_target, 3] in the normalised box, from vertices [n_source, 3] and [n_target, 3].
+
+        ``surfaces`` are what :func:`training.inference.predict.surfaces_of` says of the meshes.
+        """
         pair = [bounding_box(mesh).normalise(mesh).astype(np.float32)[None] for mesh in (source, target)]
         inputs = [torch.from_numpy(mesh).to(self._device) for mesh in pair]
-        output = self._transfer(source=inputs[0], target=inputs[1])
+        output = self._transfer(source=inputs[0], target=inputs[1], **surfaces)
         return output[0].double().cpu().numpy()
 
     @torch.no_grad()
@@ -160,9 +177,8 @@ class PoseTransfer:
         """PMD [b] of meshes [b, n, 3] in the normalised box, each transferred onto itself."""
         at_once = max(1, _VERTICES_AT_ONCE // meshes.shape[1])
         parts = torch.split(torch.from_numpy(np.ascontiguousarray(meshes, np.float32)), at_once)
-        found = [
-            point_mesh_distance(self._transfer(source=p, target=p), p) for p in (q.to(self._device) for q in parts)
-        ]
+        itself = self._bare  # a projection would bring back nearly anything
+        found = [point_mesh_distance(itself(source=p, target=p), p) for p in (q.to(self._device) for q in parts)]
         return torch.cat(found).double().cpu().numpy()
 
     @property
@@ -175,9 +191,9 @@ class PoseTransfer:
         return standing(understanding_of(self._network), vertices) if isinstance(self._network, Parts) else UPRIGHT
 
     def misfit(self, vertices: Floats) -> float:
-        """How badly a network that finds how meshes stand understands one [n, 3], Y up (`training.networks.parts`)."""
-        assert isinstance(self._network, Parts)
-        return misfit(understanding_of(self._network), vertices)
+        """How badly the parts network, or that which projects, understands a mesh [n, 3] that stands upright."""
+        assert self._parts is not None
+        return misfit(understanding_of(self._parts), vertices)
 
     def _turned_round(self, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
         """The turn about the vertical [3, 3] by which a frame faces, if the network can say; ``before``: the last."""
@@ -186,15 +202,22 @@ class PoseTransfer:
     def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Stands) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up."""
         trajectory: RootTrajectory | None = None
-        turn = np.eye(3)
+        turn, surfaces, first = np.eye(3), dict[str, Surface](), None
         for number, source in enumerate(sources):
-            vertices = check_mesh(source, name=f"source {number}").vertices
-            axes = axes or self.standing(vertices)  # that of the first frame: the others may turn round
-            vertices = axes.turned(vertices)
+            mesh = check_mesh(source, name=f"source {number}")
+            axes = axes or self.standing(mesh.vertices)  # that of the first frame: the others may turn round
+            vertices = axes.turned(mesh.vertices)
+            if first is None or not _is_same_mesh(mesh, first):  # else what is near stays so from pose to pose
+                first = mesh
+                surfaces = surfaces_of(self._network, sources=[Mesh(vertices, mesh.faces)], targets=[target])
             turn = self._turned_round(vertices, turn)
-            output = self.vertices(vertices @ turn, target.vertices) @ turn.T
+            output = self.vertices(vertices @ turn, target.vertices, **surfaces) @ turn.T
             trajectory = trajectory or RootTrajectory.from_first(vertices, scale_of(target, output))
             yield placed(target, output) + trajectory.offset(vertices)
+
+
+def _is_same_mesh(one: Mesh, other: Mesh) -> bool:
+    return len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ NETWORKS: dict[str, Callable[..., nn.Module]] = {
 """Name in a recipe -> constructor. Networks are called as ``network(source=..., target=...)``, ``[b, n, 3]`` both.
 
 A network may have ``accumulation()``: a context around the parts of a training step, for what must not change between
-them.
+them. One with ``takes_surfaces`` is told ``source_surface`` and ``target_surface`` where they are known
+(:class:`training.networks.layers.surface.Surface`).
 """
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.common.errors import CompilerError
+from training.networks.layers.surface import Surface
 
 
 def sent(values: Tensor, device: torch.device) -> Tensor:
@@ -141,8 +142,10 @@ class GraphedTransfer:
         self._network, self._precision, self._kept = network, precision, kept
 
     @torch.no_grad()
-    def __call__(self, *, source: Tensor, target: Tensor) -> Tensor:
+    def __call__(self, *, source: Tensor, target: Tensor, **surfaces: Surface) -> Tensor:
         """Return ``[b, n_target, 3]`` for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
+
+        With ``source_surface`` and ``target_surface``, for a network that takes them, nothing is replayed.
 
         Raises
         ------
@@ -151,8 +154,8 @@ class GraphedTransfer:
         """
         if source.device != target.device:
             raise ValueError(f"source is on {source.device}, target on {target.device}")
-        if source.device.type != "cuda" or len(source) != 1 or self._network.training:
-            return self._run(source, target)
+        if source.device.type != "cuda" or len(source) != 1 or self._network.training or surfaces:
+            return self._run(source, target, **surfaces)
         with _ONE_AT_A_TIME:
             graph = self._graph(source, target)
             return graph.replay(source, target) if graph else self._run(source, target)
@@ -183,10 +186,10 @@ class GraphedTransfer:
         inputs = source.shape, target.shape, source.dtype, target.dtype, source.device
         return (self._precision, *inputs, places)
 
-    def _run(self, source: Tensor, target: Tensor) -> Tensor:
+    def _run(self, source: Tensor, target: Tensor, **surfaces: Surface) -> Tensor:
         # without the cache of rounded weights: a graph would still read it after it is gone
         with products(self._precision), autocast(self._precision, source.device, cached=False):
-            return cast(Tensor, self._network(source=source, target=target))
+            return cast(Tensor, self._network(source=source, target=target, **surfaces))
 
 
 class _Graph:

@@ -8,6 +8,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from training.networks.layers.surface import Surface
+
 Counts = Sequence[int]
 """Vertices of each mesh of a batch; rows after them are padding and may hold anything."""
 
@@ -44,6 +46,7 @@ class MixedCounts(nn.Module):
         target: Tensor,
         source_counts: Counts | None = None,
         target_counts: Counts | None = None,
+        **surfaces: Surface,
     ) -> Tensor:
         """Return ``[b, n_target, 3]``; rows after a mesh's count are zero.
 
@@ -53,6 +56,8 @@ class MixedCounts(nn.Module):
             ``[b, n_source, 3]`` and ``[b, n_target, 3]``, padded.
         source_counts, target_counts
             Vertices of each mesh; None: all rows.
+        **surfaces
+            ``source_surface`` and ``target_surface`` for a network that takes them.
 
         Raises
         ------
@@ -64,18 +69,27 @@ class MixedCounts(nn.Module):
             zip(_checked("source", source, source_counts), _checked("target", target, target_counts), strict=True)
         )
         if len(set(counts)) == 1:
-            n_source, n_target = counts[0]
-            moved = self.network(source=source[:, :n_source], target=target[:, :n_target])
-            return _padded(cast(Tensor, moved), target.shape[1])
+            return self._of_counts(slice(None), *counts[0], source, target, surfaces)
         groups: dict[tuple[int, int], list[int]] = {}
         for mesh, pair in enumerate(counts):
             groups.setdefault(pair, []).append(mesh)
-        parts = [
-            _padded(self.network(source=source[meshes, :n_source], target=target[meshes, :n_target]), target.shape[1])
-            for (n_source, n_target), meshes in groups.items()
-        ]
+        parts = [self._of_counts(meshes, *pair, source, target, surfaces) for pair, meshes in groups.items()]
         order = torch.tensor([mesh for meshes in groups.values() for mesh in meshes], device=target.device)
         return torch.cat(parts)[torch.argsort(order)]
+
+    def _of_counts(
+        self,
+        meshes: list[int] | slice,
+        n_source: int,
+        n_target: int,
+        source: Tensor,
+        target: Tensor,
+        surfaces: dict[str, Surface],
+    ) -> Tensor:
+        counts = {"source_surface": n_source, "target_surface": n_target}
+        told = {name: surface.of(meshes, counts[name]) for name, surface in surfaces.items()}
+        moved = self.network(source=source[meshes, :n_source], target=target[meshes, :n_target], **told)
+        return _padded(cast(Tensor, moved), target.shape[1])
 
 
 def _check_batch(source: Tensor, target: Tensor) -> None:

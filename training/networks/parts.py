@@ -4,7 +4,8 @@ Unlike the networks of the papers it moves no vertex by itself. Both meshes are 
 weights of every vertex, rotations and joints of the parts, and where each vertex lies on the body at rest. Then the
 target's parts are turned as the source's are, its skeleton takes its joints along, and its vertices follow by linear
 blend skinning. That is learned from what the papers' networks are not told: weights, joints and rotations of bodies
-that have a rig (:mod:`training.objectives.parts`).
+that have a rig (:mod:`training.objectives.parts`). Where faces are known, vertices hear only of what is near along the
+surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is not taken for the thigh's.
 
     read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
 
@@ -13,8 +14,8 @@ No scale is taken from the source, so that missing vertices of it do not matter 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -29,7 +30,8 @@ from training.networks.layers.rigid_parts import (
     rotations_from_six,
     skinned,
 )
-from training.networks.layers.sampling import Sample, offsets, sample, taken, with_masses
+from training.networks.layers.sampling import Sample, nearness, offsets, sample, taken, with_masses
+from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
@@ -77,6 +79,7 @@ class Parts(nn.Module):
     torch.Size([2, 30, 3])
     """
 
+    takes_surfaces = True
     parents: Tensor
     above: Tensor
     upright: Tensor
@@ -100,6 +103,7 @@ class Parts(nn.Module):
         self.whole = nn.Linear(width, 2 * width)
         self.from_whole = nn.Linear(2 * width, width)
         self.mix = nn.ModuleList(nn.Linear(width, width) for _ in range(2))
+        self.around = nn.ModuleList(Around(width) for _ in range(_ROUNDS))
         self.part = nn.Linear(width, len(parents))
         self.rest = nn.Linear(width, 3)
         self.pooled = nn.Linear(width, _POOLED)
@@ -111,11 +115,25 @@ class Parts(nn.Module):
         with torch.no_grad():
             self.out.weight *= 0.1
 
-    def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+    def forward(
+        self,
+        *,
+        source: Tensor,
+        target: Tensor,
+        source_surface: Surface | None = None,
+        target_surface: Surface | None = None,
+    ) -> Tensor:
         """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
 
         Outside of training mode weights are sharpened, and the output is read in its turn: errors in reading that
         source and output share, being in one pose, cancel in the correction. One that is no better is not taken.
+
+        Parameters
+        ----------
+        source, target
+            In the normalised box of each mesh.
+        source_surface, target_surface
+            What is near along their surfaces; None where that is not known, as of points: what touches is near then.
 
         Raises
         ------
@@ -125,8 +143,9 @@ class Parts(nn.Module):
         check_pair(source, target, self.lift.weight.dtype)
         with full_precision(source):
             if self.training:
-                return self.posed_like(target, self.read_pair(source, target))
-            return self._corrected(source, target)
+                surfaces = (source_surface, target_surface) if source_surface and target_surface else None
+                return self.posed_like(target, self.read_pair(source, target, surfaces))
+            return self._corrected(sample(source, source_surface), target, sample(target, target_surface))
 
     def read(self, vertices: Tensor, drawn: Sample) -> Reading:
         """Return what is read off vertices [b, n, 3], among which a sample was drawn, in training mode or not."""
@@ -158,12 +177,19 @@ class Parts(nn.Module):
             facing = torch.atan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2])
             return misfit / its.mass.sum(1).clamp_min(1e-12), facing
 
-    def read_pair(self, source: Tensor, target: Tensor) -> tuple[Reading, Reading]:
+    def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
+        """Return the weights [b, n, part] by which vertices [b, n, 3] are posed, more certain than as they are read."""
+        return (_SHARPNESS * self.part(self._features(vertices, drawn))).softmax(2)
+
+    def read_pair(
+        self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
+    ) -> tuple[Reading, Reading]:
         """Return the readings of all vertices of both [b, n, 3], together where they are equally many."""
         if source.shape != target.shape:
-            return self.read(source, sample(source)), self.read(target, sample(target))
+            of_source, of_target = surfaces or (None, None)
+            return self.read(source, sample(source, of_source)), self.read(target, sample(target, of_target))
         both = torch.cat([source, target])
-        halves = [each.chunk(2) for each in self.read(both, sample(both))]
+        halves = [each.chunk(2) for each in self.read(both, sample(both, surfaces and joined(surfaces)))]
         return Reading._make(first for first, _ in halves), Reading._make(second for _, second in halves)
 
     def posed_like(self, target: Tensor, readings: tuple[Reading, Reading]) -> Tensor:
@@ -176,16 +202,14 @@ class Parts(nn.Module):
         moved = moved_joints(joints, turns, self.parents, self.above)
         return boxed(skinned(vertices, weights, turns, joints, moved))
 
-    def _corrected(self, source: Tensor, target: Tensor) -> Tensor:
-        drawn = sample(source)
-        wanted = self.read(drawn.vertices, drawn).rotations
-        drawn = sample(target)
+    def _corrected(self, source: Sample, target: Tensor, drawn: Sample) -> Tensor:
+        wanted = self.read(source.vertices, source).rotations
         own = self.read(target, drawn)
         weights = (_SHARPNESS * own.logits).softmax(2)
         turns = wanted @ own.rotations.mT
 
         def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
-            again = with_masses(drawn.rows, taken(output, drawn.rows), drawn.masses > 0)
+            again = with_masses(drawn.rows, taken(output, drawn.rows), drawn.masses > 0, drawn.surface)
             found = self.read(again.vertices, again).rotations
             return found, (wanted - found).square().sum((1, 2, 3))
 
@@ -196,22 +220,40 @@ class Parts(nn.Module):
         return torch.where(is_better[:, None, None], corrected, output)
 
     def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
-        """Features [b, n, width] of vertices; norms and maximum are over the sample."""
+        """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
+        of_sample = _OfSample()
+        features = self._passed(drawn.vertices, drawn.near, drawn, of_sample)
+        if vertices is drawn.vertices:
+            return features
+        return torch.cat(
+            [self._passed(some, near, drawn, of_sample.again()) for some, near in nearness(vertices, drawn)], dim=1
+        )
 
-        def normed(layer: nn.Module, inputs: tuple[Tensor, ...], shift: Tensor | float = 0) -> tuple[Tensor, ...]:
-            outputs = [layer(each) for each in inputs]
-            mean = drawn.masses[:, None] @ outputs[-1]
-            variance = (drawn.masses[:, None] @ outputs[-1].square() - mean.square()).clamp_min(0)
-            scale = torch.rsqrt(variance + _VARIANCE_FLOOR)
-            return tuple(torch.relu((each - mean) * scale + shift) for each in outputs)
+    def _passed(self, vertices: Tensor, near: Tensor, drawn: Sample, of_sample: _OfSample) -> Tensor:
+        def normed(outputs: Tensor, shift: Tensor | float = 0) -> Tensor:
+            mean, scale = of_sample(_statistics, outputs, drawn.masses)
+            return torch.relu((outputs - mean) * scale + shift)
 
-        everywhere = torch.cat([vertices, offsets(vertices, drawn)], dim=2)
-        is_sample = vertices is drawn.vertices
-        inputs: tuple[Tensor, ...] = (everywhere,) if is_sample else (everywhere, taken(everywhere, drawn.rows))
-        inputs = normed(self.features, normed(self.lift, inputs))
-        whole = torch.relu(self.whole(inputs[-1])).masked_fill(drawn.masses[..., None] == 0, 0).amax(dim=1)
+        masses = drawn.masses[..., None]
+        every = 1 / (near @ masses).clamp_min(1e-9)
+
+        def mixed(features: Tensor, layer: nn.Module) -> Tensor:
+            assert isinstance(layer, Around)
+            around = every * (near @ (masses * of_sample(layer.told, features)))
+            return features + layer.change(normed(layer.mixed(torch.cat([features, around], dim=2))))
+
         first, second = self.mix
-        return normed(second, normed(first, inputs, self.from_whole(whole)[:, None]))[0]
+        features = normed(self.lift(torch.cat([vertices, offsets(vertices, near, drawn)], dim=2)))
+        features = mixed(normed(self.features(features)), self.around[0])
+        whole = of_sample(self._whole, features, drawn.masses)
+        features = mixed(normed(first(features), whole), self.around[1])
+        features = mixed(normed(second(features)), self.around[2])
+        features = mixed(features, self.around[3])
+        return features
+
+    def _whole(self, features: Tensor, masses: Tensor) -> Tensor:
+        whole = torch.relu(self.whole(features)).masked_fill(masses[..., None] == 0, 0).amax(dim=1)
+        return self.from_whole(whole)[:, None]
 
     def _pose(
         self, vertices: Tensor, drawn: Sample, features: Tensor, logits: Tensor, rest: Tensor
@@ -220,7 +262,7 @@ class Parts(nn.Module):
         pooled = self.pooled(features)
         if vertices is not drawn.vertices:
             pooled, logits, rest = (taken(each, drawn.rows) for each in (pooled, logits, rest))
-        at, away = drawn.vertices, offsets(drawn.vertices, drawn)
+        at, away = drawn.vertices, offsets(drawn.vertices, drawn.near, drawn)
         shares = (logits.softmax(2) * drawn.masses[..., None]).mT
         mass = shares.sum(2, keepdim=True)
         both = torch.cat([pooled, away, at, rest, _products(at, at), _products(at, rest)], dim=2)
@@ -232,6 +274,48 @@ class Parts(nn.Module):
             tokens = block(tokens)
         found = self.out(self.norm(tokens))
         return rotations_from_six(found[..., :6] + self.upright), middle + found[..., 6:]
+
+
+class Around(nn.Module):
+    """What the vertices around each one say, along the surface where that is known; it changes nothing at first."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.told = nn.Linear(width, _TOLD, bias=False)
+        self.mixed = nn.Linear(width + _TOLD, width, bias=False)
+        self.change = nn.Linear(width, width)
+        with torch.no_grad():
+            self.change.weight.zero_()
+            self.change.bias.zero_()
+
+
+class _OfSample:
+    """What is computed of the sample: once, and told again in the same order to the vertices that are not in it."""
+
+    def __init__(self) -> None:
+        self._known: list[Any] = []
+        self._next = 0
+
+    def __call__(self, compute: Callable[..., _Known], *inputs: Tensor) -> _Known:
+        if self._next == len(self._known):
+            self._known.append(compute(*inputs))
+        self._next += 1
+        known: _Known = self._known[self._next - 1]
+        return known
+
+    def again(self) -> _OfSample:
+        self._next = 0
+        return self
+
+
+_Known = TypeVar("_Known")
+
+
+def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and inverse deviation [b, 1, c] of what comes out for the sample [b, k, c]."""
+    mean = masses[:, None] @ outputs
+    variance = (masses[:, None] @ outputs.square() - mean.square()).clamp_min(0)
+    return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
 
 
 class _Moments(NamedTuple):
@@ -259,6 +343,7 @@ def _moments(reading: Reading, drawn: Sample) -> _Moments:
 
 
 _HEADS = 4
+_ROUNDS, _TOLD = 4, 64
 _POOLED = 32
 _MOMENTS = 3 + 3 + 3 + 9 + 9 + 1
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import mse_loss
 
 from training.networks.layers.modulation import full_precision
+from training.networks.layers.surface import Surface
 from training.networks.parts import Parts, Reading, boxed
 
 _REST, _WEIGHTS, _ROTATIONS, _JOINTS = 5.0, 0.1, 0.3, 1.0
@@ -51,7 +52,13 @@ class Posed:
 
 
 def parts_loss(
-    network: Parts, *, source: Tensor, target: Tensor, truth: Tensor, posed: tuple[Posed, Posed]
+    network: Parts,
+    *,
+    source: Tensor,
+    target: Tensor,
+    truth: Tensor,
+    posed: tuple[Posed, Posed],
+    surfaces: tuple[Surface, Surface] | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the weighted loss and its parts, unweighted and detached.
 
@@ -65,9 +72,11 @@ def parts_loss(
         ``[b, n, 3]``.
     posed
         How the sources and the targets are posed.
+    surfaces
+        What is near along their surfaces; None: it is not told.
     """
     with full_precision(source):
-        readings = network.read_pair(source, target)
+        readings = network.read_pair(source, target, surfaces)
         output = network.posed_like(target, readings)
     reconstruction = 3 * mse_loss(output, boxed(truth))
     of_source, of_target = (_compared(reading, right) for reading, right in zip(readings, posed, strict=True))

@@ -14,7 +14,7 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.store import Dataset
 from training.data.batch import read_batch
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, evaluation_list
-from training.inference.predict import predict
+from training.inference.predict import predict, takes_surfaces
 from training.recipes.training import EvaluationRecipe
 from training.reports.plots.training_curve import training_curve
 from training.tracking.journal import read_journal
@@ -80,7 +80,8 @@ def _compared(
     triples = evaluation_list(dataset, recipe, pose_type)[: recipe.examples]
     if not len(triples):
         return []
-    batch = read_batch(dataset, triples, padded=True)
+    told = any(map(takes_surfaces, networks.values()))
+    batch = read_batch(dataset, triples, padded=True, surfaces=told)
     outputs = {name: predict(network, batch).double().cpu().numpy() for name, network in networks.items()}
     found = []
     for place, triple in enumerate(triples.tolist()):

@@ -58,6 +58,9 @@ def _evaluate_options(made: Parser) -> None:
     made.add_argument("run", metavar="RUN", help="run folder of a training, a workflow's, a checkpoint or weights")
     add_checkpoint_option(made)
     made.add_argument("--data", required=True, metavar="X.zarr", help="a complete dataset")
+    made.add_argument(
+        "--project", metavar="NAME", help="a row more: outputs fitted by the target's rigid parts, as human sees them"
+    )
     add_recipe_options(made)
     add_local_option(made)
     add_tracking_option(made)
@@ -76,16 +79,18 @@ def evaluate_command(options: argparse.Namespace) -> None:
     from workflows.pipeline.evaluate import evaluate_weights
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.tasks import TaskRunner
-    from workflows.pipeline.weights_argument import evaluated
+    from workflows.pipeline.weights_argument import evaluated, projecting
     from workflows.recipe.loader import load_recipe
 
     recipe = load_recipe(options.recipe, options.set).evaluation
     place = Path(require_reachable(options.run, option="RUN"))
     home, data = evaluated(place, options.checkpoint).home, require_reachable(options.data, option="--data", urls=True)
     open_dataset(data)
+    project = projecting(options.project)
     with _mirrored(home, options), TaskRunner(local=options.local) as tasks:
         parent = home if has_record(home) else None
-        print_text(evaluate_weights(recipe, data, place, parent=parent, tasks=tasks, which=options.checkpoint))
+        about = {"parent": parent, "which": options.checkpoint, "project": project}
+        print_text(evaluate_weights(recipe, data, place, tasks=tasks, **about))
 
 
 def _sync_options(made: Parser) -> None:

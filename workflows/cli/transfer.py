@@ -49,6 +49,9 @@ def _add_extras(made: Parser) -> None:
     made.add_argument(
         "--refine", action="store_true", help="pull the edges back to the target's (see docs/transfer.md)"
     )
+    made.add_argument(
+        "--project", metavar="NAME", help="fit the target's rigid parts to the output: as the weights human see them"
+    )
     made.add_argument("--smooth", default="0", metavar="N|0.2s", help="smooth a sequence over N frames or a time (off)")
     made.add_argument("--fps", type=_rate, default=30.0, metavar="N", help="frames a second of a sequence (30)")
     made.add_argument("--picture", action="store_true", help="write a PNG of source, target and output beside C")

@@ -89,7 +89,7 @@ def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, 
 
 def _first_pair(dataset: Dataset, recipe: EvaluationRecipe) -> Batch:
     lists = [evaluation_list(dataset, recipe, pose_type) for pose_type in POSE_TYPES]
-    return read_batch(dataset, next(triples for triples in lists if len(triples))[:1])
+    return read_batch(dataset, next(triples for triples in lists if len(triples))[:1], surfaces=True)
 
 
 def _draw(

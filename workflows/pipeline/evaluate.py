@@ -13,6 +13,7 @@ from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_row
 from training.evaluation.paper_numbers import method_name
 from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_of, report
 from training.inference.predict import load_trained
+from training.inference.projection import PROJECTED, OntoParts
 from training.recipes.training import EvaluationRecipe
 from training.reports.examples import draw_comparisons, draw_training_curve, examples_of
 from training.tracking.record import Record, flatten, read_record, update_record
@@ -34,11 +35,18 @@ def evaluate_weights(
     parent: Path | None,
     tasks: TaskRunner,
     which: Which = "result",
+    project: Path | None = None,
 ) -> str:
-    """Measure a run or weights, and show what came out; returns the report."""
+    """Measure a run or weights, and show what came out; returns the report.
+
+    ``project``: weights of a parts network; the outputs projected onto its parts have a row of their own.
+    """
     dataset, what = open_dataset(data), evaluated(place, which)
     network, trained, step = load_trained(what.weights)
-    method = Method(method_name(trained.network), str(what.weights))
+    methods = [Method(method_name(trained.network), str(what.weights))]
+    if project:
+        OntoParts.of(network, project)  # refuses what does not go together before anything is measured
+        methods.append(Method(f"{methods[0].name}{PROJECTED}", str(what.weights), str(project)))
     folder, parameters = EvaluationFolder(what.folder(dataset)), recipe.model_dump(mode="json")
     with (
         folder.alone(),
@@ -46,7 +54,7 @@ def evaluate_weights(
     ):
         with sampling(folder.load):
             runner = tasks.measure(dataset, recipe)
-            rows = evaluate([method], data, recipe, tasks=runner, keep=folder.measured, progress=evaluation_bar)
+            rows = evaluate(methods, data, recipe, tasks=runner, keep=folder.measured, progress=evaluation_bar)
         write_rows(rows, folder.rows)
         about = about_weights(step, dataset)
         text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
@@ -114,7 +122,7 @@ def summary_metrics(rows: list[Row]) -> dict[str, float]:
 
     Where several networks were measured, theirs have their names before them: ``DSFFNet/pmd_unseen``.
     """
-    found, networks = {}, [method for method in methods_of(rows) if method not in NO_OPS]
+    found, networks = {}, [name for name in methods_of(rows) if name not in NO_OPS and not name.endswith(PROJECTED)]
     for method in methods_of(rows):
         prefix = "" if networks == [method] else f"{method.replace(' ', '_')}/"
         for pose_type in sorted({row.pose_type for row in rows}):

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from datagen.common.errors import RecipeError
 from datagen.common.files import resolve_within
 from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
+from workflows.pretrained import KINDS, weights_named
 
 if TYPE_CHECKING:
     from datagen.store import Dataset
@@ -56,6 +58,25 @@ def evaluated(place: Path, which: Which = "result") -> Evaluated:
         return Evaluated(checkpoint, place.parent if is_file else place, label)
     label = "" if which in ("result", "latest") else f"step-{checkpoint.step}"
     return Evaluated(checkpoint, checkpoint.path.parent.parent, label)
+
+
+def projecting(name: str | None) -> Path | None:
+    """The weights that ``--project`` names, None where it names none.
+
+    Raises
+    ------
+    RecipeError
+        There are no such weights.
+    CheckpointError
+        They are damaged.
+    """
+    if name is None:
+        return None
+    place = weights_named(name)
+    if not place.exists():
+        known = " or ".join(KINDS)
+        raise RecipeError(f"--project {name}: there is no such run or weights; name one, or {known}, which come along")
+    return evaluated(place).weights
 
 
 def _step_folder(place: Path) -> Path | None:

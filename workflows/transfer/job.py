@@ -10,6 +10,7 @@ from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import MeshFile, check_writable, read_mesh_file
 from datagen.mesh.sequences import frames_of, is_pattern
 from training.inference.orientation import UPRIGHT, Axes, axes_of_both
+from workflows.pipeline.weights_argument import projecting
 
 _ANIMATED = ".glb"
 
@@ -31,6 +32,7 @@ class TransferJob:
     window: int = 0
     fps: float = 30.0
     refine: bool = False
+    project: Path | None = None
     picture: bool = False
     viewer: bool = False
     source_geometry: str | None = None
@@ -54,6 +56,8 @@ class TransferJob:
         window = _frames_of_window(options.smooth, options.fps)
         if window and not is_sequence:
             raise RecipeError(f"--smooth is for frames, but {source} is one mesh; name a folder, or a pattern (w*.obj)")
+        if options.project and not options.model:
+            raise RecipeError("--project is for outputs of a network that is named: add --model, or leave it out")
         of_source, of_target = axes_of_both(options.up or UPRIGHT.up, options.front or UPRIGHT.front)
         return cls(
             sources=frames_of(source) if is_sequence else [source],
@@ -63,6 +67,7 @@ class TransferJob:
             axes=None if options.align else (of_source, of_target),
             is_told=bool(options.up or options.front),
             window=window,
+            project=projecting(options.project),
             **{name: getattr(options, name) for name in _SAME},
         )
 

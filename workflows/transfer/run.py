@@ -21,7 +21,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
-from training.inference.standing import Standing
+from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from workflows.transfer.choice import chosen, standings
 from workflows.transfer.job import TransferJob
@@ -67,11 +67,13 @@ class TransferWork:
             work = cls(job, found.transfer, first=first, target=target, by=found.weights.name)
             work._take(found.standings, found.weights)
             return work
-        work = cls(job, PoseTransfer.from_run(weights), first=first, target=target)
+        work = cls(job, PoseTransfer.from_run(weights, project=job.project), first=first, target=target)
         if work.transfer.finds_standing:
             work._take(standings(work.transfer, job, meshes), weights)
         else:
             work._settle_axes(weights)
+        if job.project and work.transfer.misfit(work.axes[1].turned(target.mesh.vertices)) > STRANGE:
+            warn(f"{job.target} is no body that {job.project} knows: what it takes for parts may be none")
         return work
 
     def _settle_axes(self, weights: Path) -> None:

@@ -11,12 +11,14 @@ from datagen.common.errors import DatasetError
 from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
+from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation, Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
+from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder
 from training.data.vertex_bank import open_bank
 from training.networks.dsffnet import DSFFNet
+from training.networks.layers.surface import surface_of
 from training.networks.padded_batches import MixedCounts
 from training.objectives.edge_incidence import INCIDENCES, incidence_of, make_incidence
 
@@ -133,6 +135,33 @@ def test_part_of_a_batch_is_the_batch_of_those_triples(mixed: Dataset) -> None:
     assert torch.equal(of_part[part.edges.pairs], flat[whole.edges.pairs[inside]])
     assert torch.equal(part.edges.meshes, part.edges.pairs[:, 0] // rows)
     assert part.target_counts == whole.target_counts[1:3] and torch.equal(part.truth, whole.truth[1:3])
+
+
+def test_surfaces_are_those_of_each_mesh_alone(mixed: Dataset) -> None:
+    assert read_batch(mixed, TRIPLES, padded=True).surfaces is None
+    batch = read_batch(mixed, TRIPLES, padded=True, surfaces=True).part(1, 4).to("cpu")
+    assert batch.surfaces is not None
+    for told, own in zip(batch.surfaces, (TRIPLES[1:, :2], TRIPLES[1:, 2:]), strict=True):
+        for cells, near, (identity, pose) in zip(*told, own.tolist(), strict=True):
+            vertices, faces = mixed.vertices(identity, pose), mixed.faces(identity)
+            alone, count = surface_of(vertices, edges_of(faces)), len(vertices)
+            expected = alone.near[0][alone.cells[0]][:, alone.cells[0]]
+            assert torch.equal(near[cells[:count]][:, cells[:count]], expected)
+            assert not expected.all()
+
+
+def test_a_quarter_of_the_sources_is_not_told_the_same_ones_in_any_part(dataset: str) -> None:
+    opened = open_dataset(dataset)
+    triples = np.tile([[0, 1, 1, 2]], (64, 1))
+    table = RigTable(opened, opened.identities("training"), LEG, device="cpu")
+    augmentation = Augmentation(tiny_training(**PARTS), table.posed)
+    bank = open_bank(opened, opened.identities("training"))
+    whole = augmentation(triples, bank.batch(triples), step=3, first=0).surfaces
+    half = augmentation(triples[32:], bank.batch(triples[32:]), step=3, first=32).surfaces
+    assert whole is not None and half is not None
+    untold = whole[0].near.all(dim=2).all(dim=1)
+    assert 6 <= int(untold.sum()) <= 26 and not whole[1].near.all(dim=2).all(dim=1).any()
+    assert torch.equal(half[0].near.all(dim=2).all(dim=1), untold[32:])
 
 
 def test_reading_mixed_counts_must_be_asked_for(mixed: Dataset) -> None:

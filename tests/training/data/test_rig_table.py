@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from datagen.common.errors import RecipeError
-from datagen.mesh.geometry import bounding_box
+from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.mesh.rig import world_rotations
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation import Augmentation
 from training.data.rig_table import RigTable
 from training.data.vertex_bank import open_bank
+from training.networks.layers.surface import surface_of
 
 TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5]])
 
@@ -54,6 +55,20 @@ def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: 
             np.testing.assert_allclose(meshes[place], box.normalise(turned)[kept], atol=1e-3)
             np.testing.assert_allclose(said.joints[place], box.normalise(joints @ found[0].T), atol=1e-3)
     assert torch.equal(told.posed[0].present, torch.ones(3, 2))
+
+
+def test_surfaces_are_of_the_vertices_that_a_step_takes(legs: Dataset) -> None:
+    recipe = tiny_training(augmentation={"subset": 24, "source_holes": 0.3})
+    batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
+    whole = table_of(legs).posed(TRIPLES, batch).surfaces
+    told = Augmentation(recipe, table_of(legs).posed)(TRIPLES, batch, step=1, first=0)
+    assert whole is not None and told.surfaces is not None
+    for surface, every, rows in zip(told.surfaces, whole, (told.source_rows, told.target_rows), strict=True):
+        assert rows is not None and torch.equal(surface.cells, every.cells.gather(1, rows))
+    own = surface_of(legs.vertices(1, 0), edges_of(legs.faces(1)))
+    among = [its.near[0][its.cells[0]][:, its.cells[0]] for its in (own, whole[1])]
+    assert (among[0] == among[1]).float().mean() > 0.8  # in one pose nearly as in another
+    assert torch.equal(told.surfaces[1].near, whole[1].near)
 
 
 def test_bodies_rest_at_their_root_in_their_own_size(legs: Dataset) -> None:

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh, bounding_box, standing_point
-from training.inference.orientation import Axes
+from tests.support.three_networks import lively
+from training.inference.orientation import UPRIGHT, Axes
 from training.inference.smoothing import smoothed
 from training.inference.transfer import PoseTransfer
 from training.networks import build_network
@@ -40,6 +41,18 @@ def test_a_sequence_of_one_is_a_call(transfer: PoseTransfer) -> None:
     source, target = mesh_of(1), mesh_of(2)
     (only,) = transfer.sequence([source], target, smooth=9)
     assert np.array_equal(only.vertices, transfer(source=source, target=target).vertices)
+
+
+def test_frames_may_have_more_vertices_though_the_same_faces_and_stand_otherwise() -> None:
+    transfer = PoseTransfer(lively("parts"))
+    small, target = mesh_of(1), mesh_of(2)
+    larger = Mesh(np.concatenate([small.vertices, small.vertices[:5] * 0.9]), small.faces)
+    axes = Axes("Z", "-Y")
+    upright = list(transfer.sequence([small, larger], target, source_axes=UPRIGHT, target_axes=UPRIGHT))
+    lying = [Mesh(axes.restored(mesh.vertices), mesh.faces) for mesh in (small, larger)]
+    again = transfer.sequence(lying, target, source_axes=axes, target_axes=UPRIGHT)
+    for one, other in zip(upright, again, strict=True):
+        np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-4)
 
 
 def test_the_output_stands_on_the_ground_of_the_target() -> None:

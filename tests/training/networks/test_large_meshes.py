@@ -52,7 +52,9 @@ def test_float32_at_thirty_thousand_vertices_is_as_exact_as_the_equations_in_flo
     network, inputs = start(form).eval(), pair(form, source=500, target=30_000)
     found, literal = network(**inputs).double(), LITERAL[form](network)(**inputs).double()
     exact = network.double()(**{name: mesh.double() for name, mesh in inputs.items()})
-    assert (found - exact).square().mean() < 4 * (literal - exact).square().mean()  # twice its error; measured 1.4
+    as_the_equations = 4 * (literal - exact).square().mean()  # twice their error; measured 1.4
+    two_roundings = (2 * torch.finfo(torch.float32).eps) ** 2  # some processors need but half a one
+    assert (found - exact).square().mean() < as_the_equations.clamp_min(two_roundings)
     if start is initial:
         assert (found - exact).abs().max() < 1e-5
 

@@ -171,7 +171,7 @@ DEAD = {
     "corenet3d": {f"features.layers.{i}" for i in range(3)}
     | {f"features.blocks.{i}.linear{j}" for i in range(4) for j in (1, 2)},
 }
-DEAD["parts"] = {"lift", "features", "mix.0", "mix.1"}
+DEAD["parts"] = {"lift", "features", "mix.0", "mix.1", "around.1.change"}
 DEAD["npt origin"] = DEAD["npt maxpool"] | {"decoder.lift", "decoder.block1.linear1"}
 """Layers whose bias the norm after them takes away."""
 

@@ -6,16 +6,17 @@ from pathlib import Path
 import pytest
 
 from datagen.store import open_dataset
-from tests.support.recipes import tiny_training
+from tests.support.recipes import PARTS, tiny_training
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.engine.trainer import train
 from training.recipes.training import EvaluationRecipe
+from training.tracking.record import read_record
 from workflows.cli.declare import which_checkpoint
 from workflows.pipeline.evaluate import evaluate_weights
 from workflows.pipeline.run_folder import RunFolder
 from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import train_model
-from workflows.pipeline.weights_argument import evaluated
+from workflows.pipeline.weights_argument import evaluated, projecting
 
 RECIPE = EvaluationRecipe(triples=1, emd_points=8, examples=1)
 
@@ -59,6 +60,17 @@ def test_weights_without_a_journal_get_all_but_the_curve(workflow: Path, dataset
         assert (folder / "tables.md").exists() and (folder / "figures" / "examples.png").exists()
         assert (folder / "figures" / "training-curve.png").exists() == has_curve
     assert sorted((workflow / "run" / "checkpoints").rglob("*")) == before
+
+
+def test_projected_outputs_have_a_row_and_the_runs_own_metrics_keep_their_names(
+    workflow: Path, dataset: str, tmp_path: Path
+) -> None:
+    train(tiny_training(**PARTS, steps=1, edge_weight=0), data=dataset, run=tmp_path / "parts")
+    project = projecting(str(tmp_path / "parts"))
+    text = evaluate_weights(RECIPE, dataset, workflow / "run", parent=None, tasks=TaskRunner(), project=project)
+    assert "DSFFNet on parts" in text
+    record = read_record(workflow / "run" / "evaluation")
+    assert record is not None and {"pmd_unseen", "DSFFNet_on_parts/pmd_unseen"} <= set(record.metrics)
 
 
 def test_which_checkpoint_is_a_word_or_a_step() -> None:

@@ -17,7 +17,7 @@ from datagen.mesh.files import MeshFile, load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from tests.support.commands import command, fails, process
-from tests.support.recipes import tiny_dataset, tiny_training
+from tests.support.recipes import PARTS, tiny_dataset, tiny_training
 from training.engine.trainer import train
 from training.inference.orientation import Axes
 from training.inference.transfer import PoseTransfer
@@ -97,6 +97,22 @@ def test_refining_is_off_unless_asked(transfer: Transfer, tmp_path: Path) -> Non
     transfer("pose.obj", "person.obj", "-o", tmp_path / "b.obj", "--refine")
     plain, refined = (load_mesh(tmp_path / name).vertices for name in ("a.obj", "b.obj"))
     assert abs(plain - refined).max() > 1e-4
+
+
+def test_projection_onto_parts_is_an_option(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+    parts = tmp_path / "parts"
+    train(tiny_training(**PARTS, steps=1, edge_weight=0), data=str(run.parent / "leg.zarr"), run=parts)
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "a.obj")
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "b.obj", "--project", parts)
+    plain, projected = (load_mesh(tmp_path / name) for name in ("a.obj", "b.obj"))
+    expected = PoseTransfer.from_run(run, project=parts)(source=load_mesh("pose.obj"), target=load_mesh("person.obj"))
+    assert np.allclose(projected.vertices, expected.vertices, atol=1e-5)
+    assert abs(plain.vertices - projected.vertices).max() > 1e-4
+    with pytest.raises(RecipeError, match=r"--project humann: there is no such run or weights; name one, or human or"):
+        transfer("pose.obj", "person.obj", "-o", tmp_path / "c.obj", "--project", "humann")
+    options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", "c.obj", "--project", "human"])
+    with pytest.raises(RecipeError, match="--project is for outputs of a network that is named: add --model"):
+        options.command(options)
 
 
 def test_axes_by_hand_give_the_same_body_lying_as_its_file(transfer: Transfer, run: Path, tmp_path: Path) -> None:

@@ -123,7 +123,7 @@ def _output(shown: Shown, method: LoadedMethod) -> Panel | str:
     case = shown.case
     if method.equal_counts and len(case.source.vertices) != len(case.target.vertices):
         return "needs as many\nvertices as the target"
-    (output,) = transfer_each(method.network, [(case.source.vertices, case.target.vertices)])
+    (output,) = transfer_each(method.network, [(case.source, case.target)])
     box = bounding_box(case.truth.vertices)
     vertices = standing(box.restore(output), case.truth.vertices if shown.truth_known else None)
     found = case.score(output)

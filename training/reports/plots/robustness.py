@@ -135,7 +135,7 @@ def _heading(disturbance: Disturbance, amount: float) -> str:
 
 
 def _output(method: LoadedMethod, case: Case, source: Mesh) -> Panel:
-    (output,) = transfer_each(method.network, [(source.vertices, case.target.vertices)])
+    (output,) = transfer_each(method.network, [(source, case.target)])
     found = case.score(output)
     vertices = standing(bounding_box(case.truth.vertices).restore(output), case.truth.vertices)
     caption = in_words(found)

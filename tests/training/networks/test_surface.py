@@ -1,0 +1,141 @@
+"""What lies near along a surface: fingers that touch are not near, whatever the vertices' order, number and noise."""
+
+import numpy as np
+import pytest
+import torch
+
+from datagen.mesh.geometry import Mesh, edges_of
+from tests.support.three_networks import lively
+from training.inference.predict import surfaces_of
+from training.networks.layers.sampling import nearness, offsets, sample
+from training.networks.layers.surface import joined, of_cells, surface_of
+from training.networks.parts import Parts
+
+
+def hairpin(steps: int = 40, *, gap: float = 0.02, joined_at_the_end: bool = True) -> Mesh:
+    """Two strips, two units long, that lie on each other and are one at an end: [0, n/2) the lower, then the upper."""
+    along, across = np.linspace(-1, 1, steps), np.linspace(-0.1, 0.1, 5)
+    lower = np.stack([*np.meshgrid(along, [0.0], across, indexing="ij")], axis=-1).reshape(-1, 3)
+    vertices = np.concatenate([lower, lower + np.array([0, gap, 0])])
+    corner = (np.arange(steps - 1)[:, None] * 5 + np.arange(4)).ravel()
+    strip = np.concatenate([corner[:, None] + np.array(corners) for corners in ((0, 1, 5), (1, 6, 5))])
+    last = 5 * (steps - 1) + np.arange(4)
+    n = len(lower)
+    seam = np.concatenate([last[:, None] + np.array(corners) for corners in ((0, 1, n), (1, n + 1, n))])
+    return Mesh(vertices, np.concatenate([strip, strip + n, *([seam] if joined_at_the_end else [])]))
+
+
+def near(mesh: Mesh) -> np.ndarray:
+    """Which vertices [n, n] are near each other."""
+    cells, between = surface_of(mesh.vertices, edges_of(mesh.faces))
+    found: np.ndarray = between[0][cells[0]][:, cells[0]].numpy()
+    return found
+
+
+@pytest.mark.parametrize("steps", [30, 200])
+def test_what_touches_is_near_only_by_the_surface(steps: int) -> None:
+    mesh = hairpin(steps)
+    found, half = near(mesh), len(mesh.vertices) // 2
+    assert (found == found.T).all() and found.diagonal().all()
+    at = mesh.vertices[:, 0]
+    lower, upper = np.arange(half), np.arange(half, 2 * half)
+    far_from_the_seam = at[:half] < 0.6
+    assert not found[lower, upper][far_from_the_seam].any()
+    assert found[lower, upper][at[:half] > 0.95].all()
+    apart = np.abs(mesh.vertices[lower][:, None] - mesh.vertices[lower])
+    assert found[:half, :half][(apart < 0.11).all(axis=2)].all()
+    assert not found[:half, :half][apart[..., 0] > 0.6].any()
+
+
+def test_pieces_that_nothing_joins_are_near_and_so_are_points() -> None:
+    mesh = hairpin(joined_at_the_end=False)
+    half = len(mesh.vertices) // 2
+    assert near(mesh)[:half, half:].all() and not near(mesh)[:half, :half].all()
+    assert near(Mesh(mesh.vertices, np.empty((0, 3), np.int64))).all()
+    corners = mesh.vertices[mesh.faces]
+    apart = corners + 0.1 * (corners.mean(axis=1, keepdims=True) - corners)
+    assert near(Mesh(apart.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3))).all()
+
+
+def test_noise_hardly_lengthens_ways() -> None:
+    mesh = hairpin(200)
+    noise = np.random.default_rng(0).normal(0, 0.01, mesh.vertices.shape)
+    calm, noisy = near(mesh), near(Mesh(mesh.vertices + noise, mesh.faces))
+    assert (calm & ~noisy).sum() < 0.35 * calm.sum()  # along the vertices' own edges a half is lost
+
+
+def test_order_does_not_matter_and_seams_of_textures_are_none() -> None:
+    mesh = hairpin(60)
+    order = np.random.default_rng(0).permutation(len(mesh.vertices))
+    shuffled = Mesh(mesh.vertices[order], np.argsort(order)[mesh.faces])
+    assert (near(shuffled) == near(mesh)[order][:, order]).all()
+    half = len(mesh.vertices) // 2
+    split = mesh.faces.copy()
+    upper = (split >= half).any(axis=1)  # the upper strip and the seam: other vertices, at the same places
+    split[upper] += len(mesh.vertices)
+    twice = near(Mesh(np.concatenate([mesh.vertices, mesh.vertices]), split))
+    assert (twice[: len(mesh.vertices), : len(mesh.vertices)] == near(mesh)).all()
+
+
+def test_hair_is_near_all_at_once() -> None:
+    roots = np.random.default_rng(0).normal(size=(4000, 3))
+    fan = np.stack([np.zeros(2000, np.int64), np.arange(1, 4001, 2), np.arange(2, 4001, 2)], axis=1)
+    assert surface_of(np.concatenate([[[0.0, 0, 0]], roots]), edges_of(fan)).near.shape == (1, 1, 1)
+
+
+@pytest.mark.parametrize("steps", [100, 400])
+def test_layers_that_touch_all_over_hear_of_themselves(steps: int) -> None:
+    mesh = hairpin(steps)
+    vertices = torch.from_numpy(mesh.vertices).float()[None]
+    drawn = sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
+    kept = drawn.vertices[0][drawn.masses[0] > 0]
+    assert abs(float((kept[:, 1] > 0.01).float().mean()) - 0.5) < 0.1
+    assert torch.cat([offsets(some, each, drawn) for some, each in nearness(vertices, drawn)], 1).abs().max() < 2.5
+
+
+def test_offsets_of_one_finger_are_not_the_others() -> None:
+    mesh = hairpin(60)
+    vertices = torch.from_numpy(mesh.vertices).float()[None]
+    upper = torch.arange(len(mesh.vertices)) >= len(mesh.vertices) // 2
+    told = surface_of(mesh.vertices, edges_of(mesh.faces))
+    aside = [
+        torch.cat([offsets(some, each, drawn) for some, each in nearness(vertices, drawn)], 1)[0, :, 1]
+        for drawn in (sample(vertices), sample(vertices, told))
+    ]
+    far = vertices[0, :, 0] < 0.4
+    assert (aside[0][far & upper].mean() - aside[0][far & ~upper].mean()).abs() > 0.1  # away from each other
+    assert (aside[1][far & upper].mean() - aside[1][far & ~upper].mean()).abs() < 0.02  # as if it were alone
+
+
+def test_a_mesh_of_a_batch_is_told_what_it_is_told_alone() -> None:
+    network = lively("parts").eval()
+    assert isinstance(network, Parts)
+    pins = [hairpin(40), hairpin(40, gap=0.05), hairpin(40, joined_at_the_end=False)]
+    sources = [Mesh(pin.vertices @ np.diag([0.5, 4, 3]), pin.faces) for pin in pins]
+
+    def output(places: slice, *, told: bool) -> torch.Tensor:
+        source, target = (
+            torch.stack([torch.from_numpy(mesh.vertices).float() for mesh in its[places]]) for its in (sources, pins)
+        )
+        known = surfaces_of(network, sources=sources[places], targets=pins[places]) if told else {}
+        found: torch.Tensor = network(source=source, target=target, **known)
+        return found
+
+    together = output(slice(None), told=True)
+    for place in range(len(pins)):
+        alone = output(slice(place, place + 1), told=True)
+        torch.testing.assert_close(together[place, None], alone, rtol=0, atol=1e-5)
+    assert (output(slice(None), told=False) - together).abs().amax((1, 2))[:2].min() > 1e-3
+
+
+def test_surfaces_of_several_meshes_are_padded() -> None:
+    small, large = (surface_of(pin.vertices, edges_of(pin.faces)) for pin in (hairpin(20), hairpin(60)))
+    both = joined([small, large])
+    assert both.cells.shape == (2, 600) and both.near.shape[1] == large.near.shape[1]
+    again = both.of([0], 200)
+    size = small.near.shape[1]
+    assert torch.equal(again.cells, small.cells) and torch.equal(again.near[:, :size, :size], small.near)
+    rows = torch.tensor([[3, 150, 7]])
+    expected = small.near[0][small.cells[0]][:, small.cells[0, rows[0]]]
+    assert torch.equal(of_cells(small.apart(rows), small.cells)[0] == 0, expected)
+    assert torch.equal(small.at(rows).cells, small.cells[:, rows[0]])
