@@ -12,7 +12,6 @@ from datagen.common.resources import memory_errors
 from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.pipeline.console import print_text, server_of
-from workflows.pretrained import weights_named
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
@@ -102,9 +101,9 @@ def weights_of(options: argparse.Namespace) -> Iterator[Path | None]:
     if options.force:
         raise RecipeError("--force is for weights that are chosen by the meshes: leave it out, or --model")
     if not options.model.startswith("models:/"):
-        from workflows.pipeline.weights_argument import evaluated
+        from workflows.pipeline.weights_argument import evaluated, weights_called
 
-        yield evaluated(weights_named(options.model), options.checkpoint).weights
+        yield evaluated(weights_called(options.model, option="--model"), options.checkpoint).weights
         return
     from training.inference.registered_model import download_weights
 

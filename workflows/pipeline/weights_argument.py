@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from datagen.common.errors import RecipeError
+from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
 from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
-from workflows.pretrained import KINDS, weights_named
+from workflows.pretrained import own_names, weights_named
 
 if TYPE_CHECKING:
     from datagen.store import Dataset
@@ -60,23 +60,30 @@ def evaluated(place: Path, which: Which = "result") -> Evaluated:
     return Evaluated(checkpoint, checkpoint.path.parent.parent, label)
 
 
+def weights_called(name: str, *, option: str) -> Path:
+    """Where the weights are that an option names: a path that is there, or those of that name that come along.
+
+    Raises
+    ------
+    CheckpointError
+        There are none; what comes along is said.
+    """
+    place = weights_named(name)
+    if not place.exists():
+        known = ", ".join(own_names())
+        raise CheckpointError(f"{option} {name}: there is no such run or weights. Name one; these come along: {known}")
+    return place
+
+
 def projecting(name: str | None) -> Path | None:
     """The weights that ``--project`` names, None where it names none.
 
     Raises
     ------
-    RecipeError
-        There are no such weights.
     CheckpointError
-        They are damaged.
+        There are none, or they are damaged.
     """
-    if name is None:
-        return None
-    place = weights_named(name)
-    if not place.exists():
-        known = " or ".join(KINDS)
-        raise RecipeError(f"--project {name}: there is no such run or weights; name one, or {known}, which come along")
-    return evaluated(place).weights
+    return None if name is None else evaluated(weights_called(name, option="--project")).weights
 
 
 def _step_folder(place: Path) -> Path | None:

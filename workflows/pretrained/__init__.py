@@ -11,6 +11,11 @@ def own_weights(name: str) -> Path:
     return Path(__file__).parent / name
 
 
+def own_names() -> list[str]:
+    """The names of the weights that come with the project."""
+    return sorted(manifest.parent.name for manifest in Path(__file__).parent.glob("*/manifest.json"))
+
+
 def weights_named(name: str) -> Path:
     """The path of weights that a person names: a path that is there, or the name of some that come with the project."""
     place, own = Path(name), own_weights(name)

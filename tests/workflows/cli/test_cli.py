@@ -111,7 +111,11 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
     fails(transfer("nan.obj"), 1, "nan.obj", "1 vertices are not finite")
     fails(transfer("points.obj"), 1, "points.obj holds 3 vertices and no faces")
     fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as GLB")
-    fails(transfer("good.obj", model=tmp_path / "norun"), 1, "norun has no usable checkpoint")
+    fails(
+        transfer("good.obj", model=tmp_path / "norun"),
+        1,
+        "norun: there is no such run or weights. Name one; these come along: animals, anny-quickstart, human",
+    )
     fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
     assert not list(tmp_path.glob("out*"))
 
