@@ -22,10 +22,10 @@ from training.checkpoints.weights import fill_network
 from training.data.batch import Batch
 from training.engine.distributed import Ranks
 from training.engine.objective import objective_of
+from training.engine.optimization.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
 from training.inference.predict import load_weights
 from training.networks import network_from
 from training.networks.execution import products
-from training.optimization.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
 from training.recipes.training import TrainingRecipe
 
 

@@ -67,18 +67,14 @@ class OntoParts(nn.Module):
         return cls(network, parts.to(next(network.parameters()).device)).eval()
 
     @torch.no_grad()
-    def forward(
-        self,
-        *,
-        source: Tensor,
-        target: Tensor,
-        source_surface: Surface | None = None,
-        target_surface: Surface | None = None,
-    ) -> Tensor:
-        """Return ``[b, n_target, 3]``; see :class:`training.networks.parts.Parts` for what it takes."""
+    def forward(self, *, source: Tensor, target: Tensor, **surfaces: Surface) -> Tensor:
+        """Return ``[b, n_target, 3]`` for ``[b, n_source, 3]`` and ``[b, n_target, 3]``, each in its normalised box.
+
+        Of the ``surfaces`` that :func:`training.inference.predict.surfaces_of` finds, the target's is read.
+        """
         output = self.network(source=source, target=target)
         with full_precision(target):
-            drawn = sample(target, target_surface)
+            drawn = sample(target, surfaces.get("target_surface"))
             return projected(output, target, self.parts.skinning_weights(target, drawn), drawn)
 
 

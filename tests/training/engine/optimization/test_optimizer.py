@@ -13,8 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from tests.support.recipes import tiny_training
+from training.engine.optimization.optimizer import (
+    Schedule,
+    WeightAverage,
+    build_optimiser,
+    build_schedule,
+    schedule_factor,
+)
 from training.inference.predict import network_from
-from training.optimization.optimizer import Schedule, WeightAverage, build_optimiser, build_schedule, schedule_factor
 from training.recipes.training import ScheduleRecipe, TrainingRecipe
 
 SCHEDULES: list[dict[str, Any]] = [

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from tests.support.recipes import tiny_training
-from training.optimization.muon import Muon, orthogonal
-from training.optimization.optimizer import build_optimiser, load_optimiser
+from training.engine.optimization.muon import Muon, orthogonal
+from training.engine.optimization.optimizer import build_optimiser, load_optimiser
 from training.recipes.training import TrainingRecipe
 
 RECIPE = tiny_training(optimiser="muon", weight_decay=0.1, learning_rate=0.01)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from training.optimization.muon import Muon
+from training.engine.optimization.muon import Muon
 from training.recipes.training import ScheduleRecipe, TrainingRecipe
 
 ONE_CYCLE_FIRST = 1 / 25
