@@ -22,6 +22,8 @@ import shutil
 from contextlib import ExitStack
 
 from datagen.common.files import read_text_within
+from datagen.recipe import DatasetRecipe
+from training.recipes.training import TrainingRecipe
 from training.reports.report import NAMES, report_is_current, workflow_report
 from training.tracking.mlflow_mirror import Mirror
 from training.tracking.mlflow_store import sqlite_file
@@ -39,7 +41,7 @@ from workflows.pipeline.data_size import announce_size
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
-from workflows.pipeline.run_folder import SingleRunFolder
+from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
 from workflows.pipeline.stage import Stage, once, recorded, run_stage
 from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import is_trained, refuse_conflicts, train_model
@@ -79,22 +81,18 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     to do.
     """
     folder = SingleRunFolder(out)
-    data, run = folder.data, folder.run
-    sections = recipe.model_dump(mode="json")
+    sections = {name: value for name, value in recipe.model_dump(mode="json").items() if name != "beside" or value}
     known = has_record(out)  # the record of the whole is made again with what it shows: the evaluation and the report
-    refuse_conflicts(recipe.data, folder, {run.path: recipe.training})
+    trainings = [(folder.run, "train", MODEL, recipe.training)]
+    if recipe.beside:
+        trainings.append((folder.beside, "train-beside", f"{MODEL}-beside", recipe.beside))
+    refuse_conflicts(recipe.data, folder, {run.path: training for run, _, _, training in trainings})
     with ExitStack() as around:
         begin = once(lambda: _begin(around, recipe, folder, tasks))
-        train = Stage(
-            "train",
-            depends_on=[sections["data"], sections["training"]],
-            intact=lambda: is_trained(recipe.training, data, run.path) and has_record(run.path),
-            work=lambda: train_model(recipe.training, data, run, parent=out, tasks=tasks),
-        )
         evaluate = Stage(
             "evaluate",
-            depends_on=[sections["data"], sections["training"], sections["evaluation"]],
-            intact=lambda: known and is_evaluated(recipe.evaluation, data, run),
+            depends_on=[sections[name] for name in ("data", "training", "beside", "evaluation") if name in sections],
+            intact=lambda: known and is_evaluated(recipe.evaluation, folder.data, folder.run),
             work=lambda: _evaluate(recipe, folder, tasks),
         )
         report = Stage(
@@ -103,9 +101,27 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
             intact=lambda: known and report_is_current(out),
             work=lambda: _report(out),
         )
-        for stage in (generate_stage(recipe.data, folder, tasks), train, evaluate):
+        trained = [_training_stage(recipe.data, folder, tasks, *each) for each in trainings]
+        for stage in (generate_stage(recipe.data, folder, tasks), *trained, evaluate):
             run_stage(stage, out=out, before=begin)
         run_stage(report, out=out, before=lambda: None)
+
+
+def _training_stage(
+    data: DatasetRecipe,
+    folder: SingleRunFolder,
+    tasks: TaskRunner,
+    run: RunFolder,
+    name: str,
+    model: str,
+    training: TrainingRecipe,
+) -> Stage:
+    return Stage(
+        name,
+        depends_on=[data.model_dump(mode="json"), training.model_dump(mode="json")],
+        intact=lambda: is_trained(training, folder.data, run.path) and has_record(run.path),
+        work=lambda: train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model),
+    )
 
 
 def _begin(around: ExitStack, recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:
@@ -120,7 +136,8 @@ def _begin(around: ExitStack, recipe: WorkflowRecipe, folder: SingleRunFolder, t
 def _evaluate(recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:
     """Evaluate, and give the parent record what a person wants to see first: table, pictures, main metrics."""
     out, evaluation = folder.path, folder.run.evaluation
-    table = evaluate_weights(recipe.evaluation, folder.data, folder.run.path, parent=out, tasks=tasks)
+    beside = folder.beside.path if recipe.beside else None
+    table = evaluate_weights(recipe.evaluation, folder.data, folder.run.path, parent=out, tasks=tasks, beside=beside)
     parent, child = read_record(out), read_record(evaluation.path)
     assert parent is not None and child is not None
     shown = [os.path.relpath(path, out) for path in (evaluation.tables, evaluation.viewer, evaluation.figures)]
@@ -145,7 +162,8 @@ def closing_words(folder: SingleRunFolder, server: Server) -> str:
     out = folder.path
     table = read_text_within(folder.run.evaluation.path, "tables.md")
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-    run = shlex.quote(str(shown / "run"))
+    run, beside = (shlex.quote(str(shown / each.path.name)) for each in (folder.run, folder.beside))
+    runs = f"{run}, and beside it {beside}" if has_record(folder.beside.path) else run
     here = shown / "run" / "evaluation"
     meshes = shlex.quote(str(here / "meshes"))
     programs = _programs()
@@ -158,12 +176,12 @@ def closing_words(folder: SingleRunFolder, server: Server) -> str:
     return f"""
 {table}
 Where everything lies
-  report        {shown}/report.html, report.md  (all of this on one page, with cards of data and model)
   pictures      {here}/figures/examples.png, training-curve.png
+  report        {shown}/report.html, report.md  (all of this on one page, with cards of data and model)
   viewer        {here}/viewer.html  (turn and zoom; open it in a browser)
   meshes        {here}/meshes/*.glb
   table, rows   {here}/tables.md, rows.csv
-  run           {run}  (weights in checkpoints/, metrics.jsonl)
+  run           {runs}  (weights in checkpoints/, metrics.jsonl)
   dataset       {shown}/dataset.zarr
   MLflow        {server.uri}, experiment {EXPERIMENT!r}, model 'models:/{MODEL}@{ALIAS}'
 

@@ -93,9 +93,10 @@ def _is_theirs(line: Line) -> bool:
     return any(cell_of(cell).text.startswith(THEIRS) for cell in line)
 
 
-def about_weights(step: int, dataset: Dataset) -> str:
-    """What was measured on what, as markup for :func:`results`."""
-    return f"Weights of step {step:,} on {plain(PurePosixPath(dataset.url).name)} ({dataset.uuid})."
+def about_weights(steps: Mapping[str, int], dataset: Dataset) -> str:
+    """What was measured on what, as markup for :func:`results`; ``steps`` of each method's training."""
+    told = ", ".join(f"{step:,}{f' ({plain(name)})' if len(steps) > 1 else ''}" for name, step in steps.items())
+    return f"Weights of step {told} on {plain(PurePosixPath(dataset.url).name)} ({dataset.uuid})."
 
 
 def results(rows: Sequence[Row], *, about: str, emd_points: int) -> tuple[Text | Table, ...]:

@@ -40,7 +40,7 @@ from training.reports.card_texts import (
 from training.reports.run_summary import duration
 from training.tracking.journal import read_journal
 from training.tracking.provenance import provenance_of
-from training.tracking.record import ALIAS, MODEL, flatten
+from training.tracking.record import ALIAS, MODEL, flatten, read_record
 
 
 def model_card(run: Path, dataset: Dataset, rows: Sequence[Row] | None = None) -> Section:
@@ -181,7 +181,8 @@ def _weights_file(folder: Path) -> Path:
 
 
 def _usage(home: Path) -> str:
-    run = shown(home)
+    run, record = shown(home), read_record(home)
+    model = (record and record.model) or MODEL
     return f"""\
 # on the command line
 dsffnet transfer --model {shlex.quote(run)} --source pose.obj --target person.glb --out posed.glb
@@ -196,7 +197,7 @@ write_posed(target, posed.vertices, Path("posed.glb"))
 
 # from the registry, where MLflow has it
 import mlflow
-model = mlflow.pyfunc.load_model("models:/{MODEL}@{ALIAS}")
+model = mlflow.pyfunc.load_model("models:/{model}@{ALIAS}")
 model.predict({{"source": source_vertices, "target": target_vertices, "target_faces": target_faces}})"""
 
 

@@ -13,7 +13,7 @@ from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.store import Dataset
 from training.data.batch import read_batch
-from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, evaluation_list
+from training.evaluation.evaluate import POSE_TYPES, Row, evaluation_list
 from training.inference.predict import predict, takes_surfaces
 from training.recipes.training import EvaluationRecipe
 from training.reports.plots.training_curve import training_curve
@@ -41,11 +41,6 @@ def comparisons_of(
     """
     numbers = {(row.method, row.pose_type, row.triple): row for row in rows}
     return [one for pose_type in POSE_TYPES for one in _compared(dataset, networks, recipe, pose_type, numbers)]
-
-
-def examples_of(dataset: Dataset, network: nn.Module, recipe: EvaluationRecipe, rows: list[Row]) -> list[Comparison]:
-    """:func:`comparisons_of` one network, called as its rows call it."""
-    return comparisons_of(dataset, {_method_of(rows): network}, recipe, rows)
 
 
 def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: str) -> None:
@@ -116,10 +111,6 @@ def _comparison(
 
 def _words(row: Row) -> str:
     return f"PMD {row.pmd * 1e4:.1f}e-4, {row.millimetres:.0f} mm"
-
-
-def _method_of(rows: Sequence[Row]) -> str:
-    return next((row.method for row in rows if row.method not in NO_OPS), "output")
 
 
 def _file_name(name: str) -> str:

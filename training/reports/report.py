@@ -4,7 +4,7 @@
 >>> write_report(folder, title="A comparison", lead="On **8** new identities.", sections=[section])  # doctest: +SKIP
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +15,10 @@ from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.evaluation.document import Cell, Table, Text, plain, with_best
-from training.evaluation.evaluate import Row, read_rows
+from training.evaluation.evaluate import NO_OPS, Row, read_rows
+from training.evaluation.paper_numbers import method_name
 from training.evaluation.tables import about_weights, mean_of, methods_of, results
+from training.inference.projection import PROJECTED
 from training.recipes.training import EvaluationRecipe
 from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, shown
 from training.reports.card_texts import NETWORKS, span, vertex_counts
@@ -112,17 +114,18 @@ def workflow_report(out: Path) -> tuple[Path, Path]:
         missing = "run/evaluation/rows.csv" if record else "record.json"
         raise ReportError(f"{out} holds no finished workflow (no {missing}). Finish it with workflows/full.py")
     dataset, rows = open_dataset(str(out / "dataset.zarr")), read_rows(evaluation / "rows.csv")
+    runs = _runs(out, rows)
     sections = [
         what_was_run(out),
-        Section("Results", _results(out, dataset, rows)),
+        Section("Results", _results(runs, evaluation, dataset, rows)),
         Section("Examples", (*pictures_of(evaluation / "figures", but=("training-curve",)), *_viewer(evaluation))),
-        Section("Training", _curves(out / "run")),
+        *(Section(f"Training{_of(name, runs)}", _curves(run)) for name, run in runs.items()),
         dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
-        model_card(out / "run", dataset, rows),
+        *(_card(name, runs, dataset, rows) for name in runs),
         _files(out),
     ]
     sections = [section for section in sections if section.body]
-    return write_report(out, title=_title(record.name, dataset), lead=_lead(out, dataset, rows), sections=sections)
+    return write_report(out, title=_title(record.name, dataset), lead=_lead(runs, dataset, rows), sections=sections)
 
 
 def report_is_current(out: Path) -> bool:
@@ -140,10 +143,34 @@ def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]
     return tuple(Picture(path, CAPTIONS.get(path.stem, plain(path.stem.replace("-", " ")))) for path in paths)
 
 
-def _results(out: Path, dataset: Dataset, rows: Sequence[Row]) -> tuple[Block, ...]:
+def _runs(out: Path, rows: Sequence[Row]) -> dict[str, Path]:
+    """The trainings by the names that the rows give them: what a workflow trains, and what it trains beside it."""
+    names = [name for name in methods_of(rows) if name not in NO_OPS and not name.endswith(PROJECTED)]
+    main = _name_of(out / "run")
+    if len(names) != 2 or main not in names:
+        return {methods_of(rows)[0]: out / "run"}
+    names.remove(main)
+    return {main: out / "run", names[0]: out / "beside"}
+
+
+def _name_of(run: Path) -> str:
+    return method_name(recipe_of(require_checkpoint(run, "result")).network)
+
+
+def _of(name: str, runs: Mapping[str, Path]) -> str:
+    return f": {name}" if len(runs) > 1 else ""
+
+
+def _card(name: str, runs: Mapping[str, Path], dataset: Dataset, rows: Sequence[Row]) -> Section:
+    others = [each for each in runs if each != name]
+    card = model_card(runs[name], dataset, [row for row in rows if row.method not in others])
+    return Section(f"{card.title}{_of(name, runs)}", card.body)
+
+
+def _results(runs: Mapping[str, Path], evaluation: Path, dataset: Dataset, rows: Sequence[Row]) -> tuple[Block, ...]:
     """The evaluation's table with its definitions; the best values are marked."""
-    about = about_weights(require_checkpoint(out / "run", "result").step, dataset)
-    parts = results(rows, about=about, emd_points=_emd_points(out / "run" / "evaluation", dataset))
+    steps = {name: require_checkpoint(run, "result").step for name, run in runs.items()}
+    parts = results(rows, about=about_weights(steps, dataset), emd_points=_emd_points(evaluation, dataset))
     return tuple(_marked(part) if isinstance(part, Table) else part for part in parts)
 
 
@@ -182,19 +209,22 @@ def _title(name: str, dataset: Dataset) -> str:
     return f"{name}: pose transfer on {dataset.recipe.body.family} bodies of {counts} vertices"
 
 
-def _lead(out: Path, dataset: Dataset, rows: list[Row]) -> str:
-    checkpoint = require_checkpoint(out / "run", "result")
-    network, method = recipe_of(checkpoint).network.name, methods_of(rows)[0]
+def _lead(runs: Mapping[str, Path], dataset: Dataset, rows: list[Row]) -> str:
+    method, run = next(iter(runs.items()))
+    checkpoint = require_checkpoint(run, "result")
+    network = recipe_of(checkpoint).network.name
     grid, kind = dataset.grid, "unseen" if any(row.pose_type == "unseen" for row in rows) else "seen"
     trained = (
         f"{NETWORKS[network]}, {checkpoint.step:,} steps on {len(grid.identities('training'))} identities in "
         f"{len(grid.poses('seen')):,} poses. "
     )
     scores = {each: mean_of(rows, method=each, pose_type=kind, field="pmd") * 1e4 for each in methods_of(rows)}
-    others = ", ".join(f"{plain(each)} {score:.2f}" for each, score in scores.items() if each != method)
+    others = ", ".join(f"{plain(each)} {score:.2f}" for each, score in scores.items() if each not in runs)
+    beside = "".join(f" Beside it, {plain(each)}: **{scores[each]:.2f}**." for each in runs if each != method)
     error = mean_of(rows, method=method, pose_type=kind, field="millimetres")
     return (
-        f"{trained}On new identities in {kind} poses: **PMD {scores[method]:.2f} x 1e-4, mean error {error:.1f} mm**. "
+        f"{trained}On new identities in {kind} poses: **PMD {scores[method]:.2f} x 1e-4, mean error {error:.1f} mm**."
+        f"{beside} "
         f"For comparison, doing nothing: {others} (PMD x 1e-4)."
     )
 
@@ -203,6 +233,7 @@ def _files(out: Path) -> Section:
     names = {
         "dataset.zarr": "the dataset",
         "run": "the training run: name this folder where a model is asked for",
+        "beside": "the training beside it",
         "run/metrics.jsonl": "the journal: losses, PMD, learning rate by step",
         "run/evaluation/rows.csv": "every metric of every triple",
         "run/evaluation/tables.md": "the tables above, with their definitions",

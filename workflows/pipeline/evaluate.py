@@ -1,9 +1,11 @@
 """The stage that measures a run or weights: rows, tables, figures, meshes and viewer."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from torch import nn
 
 from datagen.common.errors import DsffnetError
 from datagen.common.files import read_text_within, write_atomically
@@ -15,14 +17,14 @@ from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_
 from training.inference.predict import load_trained
 from training.inference.projection import PROJECTED, OntoParts
 from training.recipes.training import EvaluationRecipe
-from training.reports.examples import draw_comparisons, draw_training_curve, examples_of
+from training.reports.examples import comparisons_of, draw_comparisons, draw_training_curve
 from training.tracking.record import Record, flatten, read_record, update_record
 from workflows.pipeline.generate import CONTENT, about_dataset
 from workflows.pipeline.progress import bar, sampling
 from workflows.pipeline.run_folder import EvaluationFolder, RunFolder
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.tasks import TaskRunner
-from workflows.pipeline.weights_argument import evaluated
+from workflows.pipeline.weights_argument import Evaluated, evaluated
 
 ARTIFACTS = ["rows.csv", "tables.md", "viewer.html", "figures", "meshes"]
 
@@ -36,17 +38,24 @@ def evaluate_weights(
     tasks: TaskRunner,
     which: Which = "result",
     project: Path | None = None,
+    beside: Path | None = None,
 ) -> str:
     """Measure a run or weights, and show what came out; returns the report.
 
-    ``project``: weights of a parts network; the outputs projected onto its parts have a row of their own.
+    Parameters
+    ----------
+    project
+        Weights of a parts network; the outputs projected onto its parts have a row of their own.
+    beside
+        Another run, measured on the same triples.
     """
     dataset, what = open_dataset(data), evaluated(place, which)
-    network, trained, step = load_trained(what.weights)
-    methods = [Method(method_name(trained.network), str(what.weights))]
+    shown = _shown([what, *([evaluated(beside)] if beside else [])])
+    main = next(iter(shown))
+    methods = [one.method for one in shown.values()]
     if project:
-        OntoParts.of(network, project)  # refuses what does not go together before anything is measured
-        methods.append(Method(f"{methods[0].name}{PROJECTED}", str(what.weights), str(project)))
+        OntoParts.of(shown[main].network, project)  # refuses what does not go together before anything is measured
+        methods.append(Method(f"{main}{PROJECTED}", str(what.weights), str(project)))
     folder, parameters = EvaluationFolder(what.folder(dataset)), recipe.model_dump(mode="json")
     with (
         folder.alone(),
@@ -56,19 +65,41 @@ def evaluate_weights(
             runner = tasks.measure(dataset, recipe)
             rows = evaluate(methods, data, recipe, tasks=runner, keep=folder.measured, progress=evaluation_bar)
         write_rows(rows, folder.rows)
-        about = about_weights(step, dataset)
+        about = about_weights({name: one.step for name, one in shown.items()}, dataset)
         text = report(rows, title=_title(dataset), about=about, emd_points=emd_points_of(recipe, dataset))
         write_atomically(folder.tables, text.encode())
-        draw_comparisons(examples_of(dataset, network, recipe, rows), folder.path, title=_title(dataset))
+        networks = {name: one.network for name, one in shown.items()}
+        draw_comparisons(comparisons_of(dataset, networks, recipe, rows), folder.path, title=_title(dataset))
         if RunFolder(what.home).journal.exists():  # exported weights have none
             draw_training_curve(what.home, folder.curve, baselines=_no_ops(rows))
-        end_evaluation(folder, dataset, rows, ARTIFACTS)
+        end_evaluation(folder, dataset, rows, ARTIFACTS, main=main)
     return text
 
 
-def end_evaluation(folder: EvaluationFolder, dataset: Dataset, rows: list[Row], artifacts: list[str]) -> None:
-    """Give an evaluation's record its data, its artifacts and its metrics."""
-    metrics = summary_metrics(rows)
+class _Shown(NamedTuple):
+    """Weights that are measured and drawn."""
+
+    method: Method
+    network: nn.Module
+    step: int
+
+
+def _shown(weights: Sequence[Evaluated]) -> dict[str, _Shown]:
+    """Weights by the names that tables give them; a second one of the same name says that it is."""
+    found: dict[str, _Shown] = {}
+    for each in weights:
+        network, trained, step = load_trained(each.weights)
+        name = method_name(trained.network)
+        name = f"{name} beside" if name in found else name
+        found[name] = _Shown(Method(name, str(each.weights)), network, step)
+    return found
+
+
+def end_evaluation(
+    folder: EvaluationFolder, dataset: Dataset, rows: list[Row], artifacts: list[str], *, main: str = ""
+) -> None:
+    """Give an evaluation's record its data, its artifacts and its metrics (see `summary_metrics`)."""
+    metrics = summary_metrics(rows, main=main)
     update_record(folder.path, dataset=about_dataset(dataset), artifacts=artifacts, metrics=metrics)
 
 
@@ -117,14 +148,14 @@ def _has_content(path: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0
 
 
-def summary_metrics(rows: list[Row]) -> dict[str, float]:
+def summary_metrics(rows: list[Row], *, main: str = "") -> dict[str, float]:
     """Means of the metrics as MLflow shows them, in the table's units: ``pmd_unseen``, ``target_unchanged/...``.
 
-    Where several networks were measured, theirs have their names before them: ``DSFFNet/pmd_unseen``.
+    Those of all methods but the ``main`` one have their names before them: ``DSFFNet/pmd_unseen``.
     """
-    found, networks = {}, [name for name in methods_of(rows) if name not in NO_OPS and not name.endswith(PROJECTED)]
+    found = {}
     for method in methods_of(rows):
-        prefix = "" if networks == [method] else f"{method.replace(' ', '_')}/"
+        prefix = "" if method == main else f"{method.replace(' ', '_')}/"
         for pose_type in sorted({row.pose_type for row in rows}):
             for column in COLUMNS:
                 mean = mean_of(rows, method=method, pose_type=pose_type, field=column.field)

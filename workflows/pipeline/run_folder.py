@@ -225,9 +225,10 @@ class WorkflowFolder(_Folder):
 
 
 class SingleRunFolder(WorkflowFolder):
-    """The folder of ``workflows/full.py``: a dataset, and one training on it."""
+    """The folder of ``workflows/full.py``: a dataset, one training on it, and perhaps another ``beside`` it."""
 
     run = _Entry("run", RunFolder)
+    beside = _Entry("beside", RunFolder)
 
 
 class TrialsFolder(WorkflowFolder):

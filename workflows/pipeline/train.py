@@ -34,12 +34,24 @@ HEAD = ["recipe.yaml", "provenance.json"]
 _WHERE: TypeAdapter[dict[Literal["where"], str]] = TypeAdapter(dict[Literal["where"], str])
 
 
-def train_model(recipe: TrainingRecipe, data: str, run: RunFolder, *, parent: Path | None, tasks: TaskRunner) -> None:
-    """Train to the recipe's last step, from the newest checkpoint if there is one, and register the model."""
+def train_model(
+    recipe: TrainingRecipe,
+    data: str,
+    run: RunFolder,
+    *,
+    parent: Path | None,
+    tasks: TaskRunner,
+    name: str = "train",
+    model: str = MODEL,
+) -> None:
+    """Train to the recipe's last step, from the newest checkpoint if there is one, and register the ``model``.
+
+    ``name`` is that of its record.
+    """
     dataset = open_dataset(data)
     check_run_accepts(recipe, dataset, run.path)
     parameters = recipe.model_dump(mode="json")
-    with run.alone(), recorded(run.path, kind="train", name="train", parent=parent, parameters=parameters):
+    with run.alone(), recorded(run.path, kind="train", name=name, parent=parent, parameters=parameters):
         begin_run(recipe, dataset, run)
         per_epoch, placed = order_of(recipe, dataset).steps_per_epoch, tasks.training(recipe)
         with following(run.journal, steps=last_step_of(recipe, dataset), steps_per_epoch=per_epoch):
@@ -52,7 +64,7 @@ def train_model(recipe: TrainingRecipe, data: str, run: RunFolder, *, parent: Pa
                 *HEAD,
                 *(name for name in ("metrics.jsonl", "figures", "pictures") if (run.path / name).exists()),
             ],
-            model=MODEL,
+            model=model,
             model_version=f"{dataset.uuid} step {require_checkpoint(run.path, 'result').step}",
         )
 

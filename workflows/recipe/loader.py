@@ -56,6 +56,9 @@ class WorkflowRecipe(Frozen):
     description: str = Field("", description="one line for people")
     data: DatasetRecipe = Field(default_factory=DatasetRecipe)
     training: TrainingRecipe = Field(default_factory=TrainingRecipe)
+    beside: TrainingRecipe | None = Field(
+        None, description="another training on the same data, measured beside the first; its keys are those of training"
+    )
     evaluation: EvaluationRecipe = Field(default_factory=EvaluationRecipe)
 
     @model_validator(mode="after")
@@ -66,11 +69,12 @@ class WorkflowRecipe(Frozen):
             "data.triples.count": self.data.triples.count,
         }
         missing = [name for name, size in sizes.items() if size == 0]
-        if self.training.early_stopping and missing:
-            raise ValueError(
-                f"training.early_stopping goes by the PMD on unseen poses, but {missing[0]} is 0: "
-                f"set {missing[0]}, or training.early_stopping=null"
-            )
+        for section, training in (("training", self.training), ("beside", self.beside)):
+            if training and training.early_stopping and missing:
+                raise ValueError(
+                    f"{section}.early_stopping goes by the PMD on unseen poses, but {missing[0]} is 0: "
+                    f"set {missing[0]}, or {section}.early_stopping=null"
+                )
         return self
 
 
@@ -96,7 +100,7 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     values = with_absolute_paths(_with_training(values, name), folder)
     here = Path.cwd()
     words = [(key, with_absolute_paths({(last := key.rsplit(".", 1)[-1]): value}, here)[last]) for key, value in words]
-    values = changed(values, words, kinds=_KINDS)
+    values = changed(values, words, kinds=(*_KINDS, ("beside.network", "name", DEFAULT_NETWORK)))
     if not values:
         raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
     with recipe_faults(where):
@@ -153,6 +157,8 @@ def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -
         is_list = get_origin(field.annotation) is tuple
         parts = [] if is_list else list(_parts(field.annotation))
         sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+        if name == "beside":
+            sections = []
         if sections == [TrainingRecipe]:
             names = ", ".join(known_trainings())
             yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
@@ -205,6 +211,8 @@ def _describe(fault: Any) -> str:
     key = ".".join(part for before, part in parts if not (before in _UNIONS and part in _MEMBERS))
     if fault["type"] == "extra_forbidden":
         known = [line.split()[0] for line in describe_fields()]
+        if key.startswith("beside."):
+            known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
         if key in known:
             return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
         return f"unknown key {shown(key)}{nearest(key, known)}"
@@ -220,7 +228,7 @@ def _parts(annotation: Any) -> Iterator[Any]:
             yield from _parts(member)
 
 
-_NO_SECTIONS = "is not a mapping of sections (data, training, evaluation), or is empty"
+_NO_SECTIONS = "is not a mapping of sections (data, training, beside, evaluation), or is empty"
 _UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
 
 

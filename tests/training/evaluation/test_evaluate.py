@@ -26,7 +26,7 @@ from training.inference.predict import load_trained, predict
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import edge_length_ratio_error, point_mesh_distance
 from training.recipes.training import CoreNet3dRecipe, DsffnetRecipe, EvaluationRecipe, NetworkRecipe, NptRecipe
-from training.reports.examples import examples_of
+from training.reports.examples import comparisons_of
 
 RECIPE = EvaluationRecipe(emd_points=16, chunk=3)
 
@@ -87,7 +87,7 @@ def test_meshes_of_other_counts_are_each_measured_over_their_own_vertices(tmp_pa
         edges = torch.from_numpy(edges_of(data.faces(row.target_identity)))
         assert row.pmd == pytest.approx(float(point_mesh_distance(output, batch.truth)), rel=1e-4)
         assert row.edge_ratio == pytest.approx(float(edge_length_ratio_error(output, batch.truth, edges)), rel=1e-4)
-    examples = examples_of(data, network, RECIPE, rows)
+    examples = comparisons_of(data, {"DSFFNet": network}, RECIPE, rows)
     assert all(
         mesh.vertices.shape == one.truth.vertices.shape
         for one in examples

@@ -15,7 +15,7 @@ from tests.support.recipes import mixed_dataset, tiny_training
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.inference.predict import network_from
 from training.recipes.training import EvaluationRecipe
-from training.reports.examples import comparisons_of, draw_comparisons, examples_of
+from training.reports.examples import comparisons_of, draw_comparisons
 from training.viz.transfer_example import Comparison
 
 RECIPE = EvaluationRecipe(emd_points=8, examples=2)
@@ -81,7 +81,7 @@ def test_a_method_without_rows_has_a_picture_and_no_numbers(dataset: str) -> Non
 def test_meshes_of_different_vertex_counts_are_compared(tmp_path: Path) -> None:
     opened = generate(mixed_dataset(), str(tmp_path / "mixed.zarr"))
     network = network_from(tiny_training().network).eval()
-    for one in examples_of(opened, network, RECIPE, rows_of(opened, "DSFFNet", 0.001)):
+    for one in comparisons_of(opened, {"DSFFNet": network}, RECIPE, rows_of(opened, "DSFFNet", 0.001)):
         assert one.truth is not None
         assert one.outputs["DSFFNet"].vertices.shape == one.truth.vertices.shape
         assert np.isfinite(one.outputs["DSFFNet"].vertices).all()
@@ -99,6 +99,8 @@ def test_figure_viewer_and_meshes_of_every_method_are_written(dataset: str, tmp_
 
 def test_the_output_of_a_single_method_is_called_output(dataset: str, tmp_path: Path) -> None:
     opened = open_dataset(dataset)
-    draw_comparisons(examples_of(opened, Unchanged(), RECIPE, rows_of(opened, "mine", 0.1))[:1], tmp_path, title="legs")
+    draw_comparisons(
+        comparisons_of(opened, {"mine": Unchanged()}, RECIPE, rows_of(opened, "mine", 0.1))[:1], tmp_path, title="legs"
+    )
     names = sorted(path.name for path in (tmp_path / "meshes").iterdir())
     assert names == [f"00-{role}.glb" for role in ("output", "source", "target", "truth")]

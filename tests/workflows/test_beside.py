@@ -1,0 +1,54 @@
+"""A workflow whose recipe has a training ``beside`` the first: both in one table, one picture, one report."""
+
+from pathlib import Path
+
+import pytest
+
+from datagen.common.errors import RecipeError
+from tests.support.recipes import tiny_dataset, tiny_training
+from training.evaluation.evaluate import read_rows
+from training.evaluation.tables import methods_of
+from training.recipes.training import EvaluationRecipe
+from training.tracking.record import MODEL, read_record
+from workflows import full
+from workflows.pipeline.run_folder import SingleRunFolder
+from workflows.pipeline.tasks import TaskRunner
+from workflows.recipe.loader import WorkflowRecipe, load_recipe
+
+
+def test_both_are_trained_and_measured_on_the_same_triples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = WorkflowRecipe(
+        data=tiny_dataset(),
+        training=tiny_training(steps=2),
+        beside=tiny_training(steps=2, network={"name": "npt", "encoder_widths": (4, 8, 13)}),
+        evaluation=EvaluationRecipe(emd_points=16, examples=1, chunk=4),
+    )
+    full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
+    folder = SingleRunFolder(tmp_path)
+    rows = read_rows(folder.run.evaluation.rows)
+    triples = {name: [r.triple for r in rows if r.method == name] for name in methods_of(rows)}
+    assert {"DSFFNet", "NPT"} < triples.keys() and triples["DSFFNet"] == triples["NPT"]
+    assert sorted(path.name for path in folder.run.evaluation.meshes.glob("00-output*")) == [
+        "00-output-DSFFNet.glb",
+        "00-output-NPT.glb",
+    ]
+    whole, beside = read_record(tmp_path), read_record(folder.beside.path)
+    assert whole is not None and {"pmd_unseen", "NPT/pmd_unseen"} < whole.metrics.keys()
+    assert beside is not None and (beside.name, beside.model) == ("train-beside", f"{MODEL}-beside")
+    report = folder.report.read_text()
+    assert "Model card: NPT" in report and f"models:/{MODEL}-beside@" in report and "Beside it, NPT" in report
+    capsys.readouterr()
+    full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
+    said = capsys.readouterr().out
+    assert all(f"{stage}: skipped" in said for stage in ("generate", "train", "train-beside", "evaluate", "report"))
+
+
+def test_its_keys_are_those_of_training() -> None:
+    words = ["beside.network.name=npt", "beside.steps=7"]
+    recipe = load_recipe("smoke", words)
+    assert recipe.beside is not None and (recipe.beside.network.name, recipe.beside.steps) == ("npt", 7)
+    assert load_recipe("quickstart", ["beside=null"]).beside is None
+    with pytest.raises(RecipeError, match=r"unknown key 'beside.stepz', did you mean 'beside.steps'\?"):
+        load_recipe("smoke", ["beside.stepz=7"])
+    with pytest.raises(RecipeError, match=r"beside.early_stopping goes by .*beside.early_stopping=null"):
+        load_recipe("smoke", ["beside.early_stopping=3", "data.poses.unseen=0"])
