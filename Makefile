@@ -1,9 +1,8 @@
 # `make` lists the targets. Any of them first brings .venv up to date; when nothing changed that costs nothing.
 #
 # PYTHON       the interpreter for .venv; left empty, python3.11 or else python3, if that is 3.11 or newer
-# TORCH_INDEX  one more package index, for torch. Empty by default, so that a machine which reaches PyPI only can install; on Linux
-#              PyPI's torch brings CUDA (some 3 GB to fetch), right for a GPU. Without a GPU, the same release for CPU is 200 MB:
-#              make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# TORCH_INDEX  one more package index, for torch. Left empty, Linux without a GPU takes PyTorch's own index of CPU builds (200 MB in the
+#              place of some 3 GB with CUDA), if it answers and pip was not told of others: deploy/environment.py
 # ARGS         more arguments for `make run` and `make test`
 # OUT          the folder whose MLflow store `make ui` shows; UI_PORT its port
 PYTHON ?=
@@ -88,18 +87,8 @@ ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another 
 $(READY): constraints.txt pyproject.toml deploy/requirements.txt
 	@set -e; \
 	exec 9<Makefile; flock 9 2>/dev/null || :; \
-	if [ ! -e $@ ]; then \
-	    $(FIND_PYTHON); \
-	    echo "Making .venv with $$("$$python" --version); the packages may take some minutes"; \
-	    [ -n "$(TORCH_INDEX)" ] || command -v nvidia-smi >/dev/null || [ "$$(uname -s)" != Linux ] || \
-	        echo "(no GPU here? TORCH_INDEX, explained in the Makefile, may save a large download)"; \
-	    "$$python" -m venv --clear .venv; \
-	fi; \
-	rm -f $@; \
-	[ -t 1 ] || quiet=--quiet; \
-	$(BIN)/python -m pip install $(PIP_FLAGS) $$quiet --constraint constraints.txt \
-	    --editable '.[dev]' --requirement deploy/requirements.txt; \
-	touch $@
+	if [ -e $@ ]; then python=$(BIN)/python; else $(FIND_PYTHON); fi; \
+	TORCH_INDEX='$(TORCH_INDEX)' "$$python" deploy/environment.py
 
 # The newest releases that fit together, from a fresh Python 3.11 on Linux x86-64. torch goes first so that its release is ours to
 # choose. CUDA packages are left out: the torch release itself asks for exact ones where it needs them.

@@ -1,0 +1,92 @@
+"""Making the environment: which installer, from where, what it says meanwhile, what it leaves when it fails."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tests.support.commands import ROOT
+
+PYTHON = Path(".venv/bin/python")
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    """deploy/environment.py in an empty folder, where there is no uv, no GPU, and pip was told of nothing."""
+    spec = spec_from_file_location("environment", ROOT / "deploy" / "environment.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TORCH_INDEX", raising=False)
+    monkeypatch.setattr(module.shutil, "which", lambda name: None)
+    monkeypatch.setattr(module, "has_own_indexes", lambda python: False)
+    monkeypatch.setattr(module, "cpu_index", lambda: "https://cpu.example")
+    return module
+
+
+def test_pip_takes_the_cpu_builds_only_where_it_was_told_of_no_others(
+    environment: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "https://cpu.example" in environment.installer(PYTHON)
+    monkeypatch.setattr(environment, "has_own_indexes", lambda python: True)
+    assert "--extra-index-url" not in environment.installer(PYTHON)
+    monkeypatch.setenv("TORCH_INDEX", "https://asked.example")
+    assert "https://asked.example" in environment.installer(PYTHON)
+
+
+def test_uv_is_taken_where_pip_was_told_of_nothing_that_it_would_not_know(
+    environment: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment.shutil, "which", lambda name: "/bin/uv" if name == "uv" else None)
+    command = environment.installer(PYTHON)
+    assert command[:3] == ["/bin/uv", "pip", "install"] and command[command.index("--torch-backend") + 1] == "cpu"
+    monkeypatch.setattr(environment, "cpu_index", lambda: "")
+    assert "--torch-backend" not in environment.installer(PYTHON)
+    monkeypatch.setattr(environment, "has_own_indexes", lambda python: True)
+    assert environment.installer(PYTHON)[0] == str(PYTHON)
+
+
+@pytest.mark.parametrize(("name", "own"), [("PIP_INDEX_URL", True), ("PIP_FIND_LINKS", True), ("PIP_TIMEOUT", False)])
+def test_what_pip_was_told_is_read_from_pip(name: str, own: bool, tmp_path: Path) -> None:
+    clean = {key: value for key, value in os.environ.items() if not key.startswith("PIP_")}
+    code = "import sys; sys.path[:0] = ['deploy']; import environment as e; print(e.has_own_indexes(sys.executable))"
+    told = clean | {name: "20", "PIP_CONFIG_FILE": os.devnull}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=told, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(own)]
+
+
+def test_what_is_fetched_is_said_every_few_seconds(environment: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = ["Collecting a\n", "  Downloading https://x.example/a-1-py3.whl (1.5 MB)\n", "Downloading b.whl (500 kB)\n"]
+    progress = environment.Progress(every=0.05)
+
+    def slowly() -> Iterator[str]:
+        for line in [*lines, "Installing collected packages: a, b, c\n"]:
+            yield line
+            progress._ended.wait(0.15)
+
+    assert [line for line in progress.of(slowly()) if "Installing" not in line] == lines
+    progress.end()
+    said = capsys.readouterr().out
+    assert "1 files of 2 MB fetched, 0 installed: fetching a-1-py3.whl (1.5 MB)" in said
+    assert "2 files of 2 MB fetched, 0 installed: installing 3 packages" in said
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_an_environment_is_ready_only_when_all_was_installed(
+    status: int, environment: ModuleType, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    command = [sys.executable, "-c", f"print('No matching distribution'); raise SystemExit({status})"]
+    monkeypatch.setattr(environment.subprocess, "run", lambda *_, **__: None)  # no venv is made
+    monkeypatch.setattr(environment, "installer", lambda python: command)
+    monkeypatch.setattr(environment, "by_pip", lambda python: command)
+    Path(".venv").mkdir()
+    assert environment.main() == status
+    assert (Path(".venv") / ".ready").exists() is (status == 0)
+    shown = capfd.readouterr()
+    assert ("No matching distribution" in shown.err) is (status == 3)
