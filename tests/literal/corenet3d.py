@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 from torch.nn.utils import spectral_norm
 
+from tests.literal.norms import InstanceNorm, OverVertices, weigh
 from training.networks.corenet3d import CoreNet3D
 from training.networks.released_weights import released_names
 
@@ -25,30 +26,29 @@ class LiteralFeatures(nn.Module):
         super().__init__()
         first, second, third = widths
         self.layer1, self.layer2 = nn.Conv1d(3, first, 1), nn.Conv1d(first, second, 1)
-        self.layer3 = nn.Conv1d(second, third, 1)
+        self.layer3, self.norm = nn.Conv1d(second, third, 1), InstanceNorm()
 
     def forward(self, vertices: Tensor) -> Tensor:
-        norm = nn.functional.instance_norm
-        hidden = leaky_relu(norm(self.layer1(vertices)), 0.2)
-        hidden = leaky_relu(norm(self.layer2(hidden)), 0.2)
-        return norm(self.layer3(hidden))
+        hidden = leaky_relu(self.norm(self.layer1(vertices)), 0.2)
+        hidden = leaky_relu(self.norm(self.layer2(hidden)), 0.2)
+        return self.norm(self.layer3(hidden))
 
 
 class LiteralResidualBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.conv1, self.conv2, self.prelu = nn.Conv1d(width, width, 1), nn.Conv1d(width, width, 1), nn.PReLU()
+        self.norm = InstanceNorm()
 
     def forward(self, features: Tensor) -> Tensor:
-        norm = nn.functional.instance_norm
-        inner = norm(self.conv2(self.prelu(norm(self.conv1(features)))))
+        inner = self.norm(self.conv2(self.prelu(self.norm(self.conv1(features)))))
         return self.prelu(inner + features)
 
 
 class LiteralCorrespondence(nn.Module):
-    def __init__(self, widths: list[int], centre: bool) -> None:
+    def __init__(self, widths: list[int], centre: bool, norm_weights: str) -> None:
         super().__init__()
-        self.centre = centre
+        self.centre, self.norm_weights = centre, norm_weights
         self.adaptive_feature = LiteralFeatures(widths)
         self.layer = nn.Sequential(*(LiteralResidualBlock(widths[-1]) for _ in range(4)))
         self.theta, self.phi = nn.Conv1d(widths[-1], widths[-1], 1), nn.Conv1d(widths[-1], widths[-1], 1)
@@ -59,25 +59,30 @@ class LiteralCorrespondence(nn.Module):
 
     def forward(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return identity features ``[b, c, n]``, warped points ``[b, n, 3]`` and the row-normalised transport."""
-        identity = self.described(target)
+        norm = self.adaptive_feature.norm
+        weigh(self, self.norm_weights, target.transpose(1, 2))
+        identity, rows = self.described(target), norm.weights(target)
+        weigh(self, self.norm_weights, source.transpose(1, 2))
         theta, phi = scaled(self.theta(identity)), scaled(self.phi(self.described(source)))
-        transport = literal_transport(theta.transpose(1, 2) @ phi)
+        transport = literal_transport(theta.transpose(1, 2) @ phi, rows.mT, norm.weights(source).mT)
         return identity, transport @ source.transpose(1, 2), transport
 
 
-def literal_transport(cosine: Tensor) -> Tensor:
-    """Return the whole transport after five iterations, divided by its rows' sums, for cosines ``[b, n, m]``."""
-    _, targets, sources = cosine.shape
+def literal_transport(cosine: Tensor, targets: Tensor | float, sources: Tensor | float) -> Tensor:
+    """Return the whole transport after five iterations, divided by its rows' sums, for cosines ``[b, n, m]``.
+
+    Its marginals are ``[b, n, 1]`` and ``[b, m, 1]``, or one number for all.
+    """
     kernel = torch.exp(-(1.0 - cosine) / 0.03)
-    left = torch.ones_like(cosine[:, :, :1]) / targets
+    left = torch.ones_like(cosine[:, :, :1]) * targets
     for _ in range(5):
-        right = (1 / sources) / (kernel.transpose(1, 2) @ left + 1e-8)
-        left = (1 / targets) / (kernel @ right + 1e-8)
+        right = sources / (kernel.transpose(1, 2) @ left + 1e-8)
+        left = targets / (kernel @ right + 1e-8)
     transport = left * kernel * right.transpose(1, 2)
     return transport / transport.sum(dim=2, keepdim=True)
 
 
-class LiteralElaIN(nn.Module):
+class LiteralElaIN(OverVertices):
     def __init__(self, width: int, identity: int) -> None:
         super().__init__()
         self.mlp_same = nn.Conv1d(identity, width, 1)
@@ -86,9 +91,9 @@ class LiteralElaIN(nn.Module):
 
     def forward(self, hidden: Tensor, identity: Tensor) -> Tensor:
         side = self.mlp_same(identity)
-        mean = hidden.mean(dim=2, keepdim=True)
-        deviation = torch.sqrt(hidden.var(dim=2, keepdim=True, correction=1) + 1e-5)
-        weight = self.mlp_weight(torch.cat([side.mean(dim=2, keepdim=True), mean], dim=1))
+        mean, unbiased = self.mean(hidden), hidden.shape[2] / (hidden.shape[2] - 1)
+        deviation = torch.sqrt(unbiased * self.mean((hidden - mean).square()) + 1e-5)
+        weight = self.mlp_weight(torch.cat([self.mean(side), mean], dim=1))
         gamma = self.mlp_gamma(side) * weight + deviation * (1 - weight)
         beta = self.mlp_beta(side) * weight + mean * (1 - weight)
         return (hidden - mean) / deviation * (1 + gamma) + beta
@@ -133,7 +138,7 @@ class LiteralCoreNet3D(nn.Module):
         features, generator = fast.features, fast.generator
         widths = [layer.out_features for layer in features.layers]
         channels = [layer.out_features for layer in (generator.lift, generator.linear2, generator.linear3)]
-        self.correspondence = LiteralCorrespondence(widths, features.centre)
+        self.correspondence = LiteralCorrespondence(widths, features.centre, fast.norm_weights)
         self.generator = LiteralGenerator(channels, widths[-1])
         self.to(fast.theta.weight.dtype)
         values = fast.state_dict()
@@ -149,4 +154,5 @@ class LiteralCoreNet3D(nn.Module):
 
     def with_correspondence(self, *, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         identity, warped, transport = self.correspondence(source.transpose(1, 2), target.transpose(1, 2))
+        weigh(self.generator, self.correspondence.norm_weights, target)
         return self.generator(identity, warped).transpose(1, 2), warped, transport

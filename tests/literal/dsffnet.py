@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from tests.literal.norms import InstanceNorm, weigh
 from training.networks.dsffnet import DSFFNet
 from training.networks.layers.modulation import FFAdaIN
 
@@ -15,7 +16,7 @@ class LiteralNorm(nn.Module):
     def __init__(self, channels: int, latent: int, fusion: bool, target_side: bool) -> None:
         super().__init__()
         self.fusion, self.target_side = fusion, target_side
-        self.norm = nn.InstanceNorm1d(channels)
+        self.norm = InstanceNorm()
         if target_side:
             self.identity_scale, self.identity_shift = nn.Conv1d(3, channels, 1), nn.Conv1d(3, channels, 1)
         if fusion:
@@ -51,7 +52,7 @@ class LiteralEncoder(nn.Module):
     def __init__(self, widths: list[int]) -> None:
         super().__init__()
         self.layers = nn.ModuleList(nn.Conv1d(i, o, 1) for i, o in zip([3, *widths], widths, strict=False))
-        self.norms = nn.ModuleList(nn.InstanceNorm1d(width) for width in widths)
+        self.norms = nn.ModuleList(InstanceNorm() for _ in widths)
 
     def features(self, source: Tensor) -> Tensor:
         for layer, norm in zip(self.layers, self.norms, strict=True):
@@ -84,6 +85,7 @@ class LiteralDSFFNet(nn.Module):
 
     def __init__(self, fast: DSFFNet) -> None:
         super().__init__()
+        self.norm_weights = fast.norm_weights
         decoder = fast.decoder
         first = decoder.block1.norm1
         assert isinstance(first, FFAdaIN)
@@ -96,5 +98,7 @@ class LiteralDSFFNet(nn.Module):
         self.load_state_dict({name: value.reshape(own[name].shape) for name, value in fast.state_dict().items()})
 
     def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        weigh(self.encoder, self.norm_weights, source)
+        weigh(self.decoder, self.norm_weights, target)
         latent = self.encoder(source.transpose(1, 2))
         return self.decoder(latent, target.transpose(1, 2)).transpose(1, 2)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.literal.dsffnet import LiteralEncoder
+from tests.literal.norms import InstanceNorm, weigh
 from training.networks.npt import NPT
 
 
@@ -14,7 +15,7 @@ class LiteralSPAdaIN(nn.Module):
 
     def __init__(self, channels: int, normalised: bool) -> None:
         super().__init__()
-        self.norm = nn.InstanceNorm1d(channels) if normalised else nn.Identity()
+        self.norm = InstanceNorm() if normalised else nn.Identity()
         self.scale, self.shift = nn.Conv1d(3, channels, 1), nn.Conv1d(3, channels, 1)
 
     def forward(self, hidden: Tensor, vertices: Tensor) -> Tensor:
@@ -56,7 +57,7 @@ class LiteralNPT(nn.Module):
 
     def __init__(self, fast: NPT) -> None:
         super().__init__()
-        self.pooled = fast.variant == "maxpool"
+        self.pooled, self.norm_weights = fast.variant == "maxpool", fast.norm_weights
         widths = [layer.out_features for layer in fast.encoder.linear_layers()]
         self.encoder = LiteralEncoder(widths)
         self.decoder = LiteralDecoder(widths[-1] + 3, normalised=not self.pooled)
@@ -65,6 +66,8 @@ class LiteralNPT(nn.Module):
         self.load_state_dict({name: value.reshape(own[name].shape) for name, value in fast.state_dict().items()})
 
     def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        weigh(self.encoder, self.norm_weights, source)
+        weigh(self.decoder, self.norm_weights, target)
         vertices = target.transpose(1, 2)
         latent = self._latent(source.transpose(1, 2), vertices.shape[2])
         return self.decoder(torch.cat([latent, vertices], dim=1), vertices).transpose(1, 2)

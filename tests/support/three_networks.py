@@ -32,6 +32,8 @@ LITERAL: dict[str, Callable[[Any], nn.Module]] = {
     "npt origin": LiteralNPT,
     "corenet3d": LiteralCoreNet3D,
 }
+BY_AREA = [f"{form} by area" for form in LITERAL]
+"""The same whose vertices count in norms by the area around them; names for `initial`, `lively` and `pair`."""
 PAIRING = "npt origin"
 """The form whose source and target must have equally many vertices."""
 
@@ -52,7 +54,14 @@ _WIDE: dict[str, dict[str, Any]] = {
 def initial(form: str, *, wide: bool = False, seed: int = 0, **options: Any) -> nn.Module:
     """Return the form as it is before training, in float32; ``options`` of its constructor go before its widths."""
     torch.manual_seed(seed)
-    return FORMS[form](**(_WIDE if wide else _NARROW)[form.split(maxsplit=1)[0]] | options)
+    if form in BY_AREA:
+        options = {"norm_weights": "area"} | options
+    return FORMS[plain(form)](**(_WIDE if wide else _NARROW)[form.split(maxsplit=1)[0]] | options)
+
+
+def plain(form: str) -> str:
+    """Return the name of a form without its weights."""
+    return form.removesuffix(" by area")
 
 
 def lively(
@@ -84,7 +93,7 @@ def meshes(vertices: int, *, seed: int, batch: int = 2, dtype: torch.dtype = tor
 
 def pair(form: str, *, source: int = 33, target: int = 27, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     """Return a source and a target, of different numbers of vertices where the form takes them."""
-    source = target if form == PAIRING else source
+    source = target if plain(form) == PAIRING else source
     return {"source": meshes(source, seed=1, dtype=dtype), "target": meshes(target, seed=2, dtype=dtype)}
 
 

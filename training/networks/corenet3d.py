@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import sys
 from contextlib import AbstractContextManager
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
-from training.networks.layers.elain import SLOPE, Generator, iterated_once
-from training.networks.layers.input_checks import check_pair
-from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, with_zero_gradients
+from training.networks.layers.elain import SLOPE, Generator, Identity, iterated_once
+from training.networks.layers.input_checks import check_norm_weights, check_pair
+from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, vertex_mean, with_zero_gradients
 from training.networks.layers.optimal_transport import transport_matrix, warp
+from training.networks.layers.sampling import masses_by
 
 INITIAL_GAIN = 0.02
 """Gain of the initial Xavier normal weights (released code)."""
@@ -55,6 +56,10 @@ class CoreNet3D(nn.Module):
     centre_features
         True subtracts from a vertex's feature its mean over the channels before it is scaled to unit length. Some
         accounts of the method have this; the released code, and so the weights trained with it, do not.
+    norm_weights
+        How much vertices count in instance norms, in ElaIN's means and deviations and in the optimal transport:
+        ``"uniform"``, all the same, as published; ``"area"``, by the area around them, so that it matters less how
+        densely vertices lie.
 
     Notes
     -----
@@ -97,11 +102,14 @@ class CoreNet3D(nn.Module):
         feature_widths: tuple[int, int, int] = (64, 128, 256),
         generator_widths: tuple[int, int, int] = (1024, 512, 256),
         centre_features: bool = False,
+        norm_weights: Literal["uniform", "area"] = "uniform",
     ) -> None:
         super().__init__()
         for name, widths in (("feature_widths", feature_widths), ("generator_widths", generator_widths)):
             if len(widths) != 3 or min(widths) < 1:
                 raise ValueError(f"{name} must be three positive integers, got {widths}")
+        check_norm_weights(norm_weights)
+        self.norm_weights = norm_weights
         width = feature_widths[-1]
         self.features = VertexFeatures(tuple(feature_widths), centre_features)
         self.theta, self.phi = nn.Linear(width, width), nn.Linear(width, width)
@@ -118,9 +126,9 @@ class CoreNet3D(nn.Module):
         ValueError
             If shapes or dtypes do not fit.
         """
-        identity, theta, phi = self._described(source, target)
+        identity, theta, phi, masses = self._described(source, target)
         with full_precision(source):
-            warped = warp(theta, phi, source)
+            warped = warp(theta, phi, source, identity.masses, masses)
         return self._refined(warped, identity)
 
     def accumulation(self) -> AbstractContextManager[None]:
@@ -135,21 +143,22 @@ class CoreNet3D(nn.Module):
         ValueError
             If shapes or dtypes do not fit.
         """
-        identity, theta, phi = self._described(source, target)
+        identity, theta, phi, masses = self._described(source, target)
         with full_precision(source):
-            transport = transport_matrix(theta, phi)
+            transport = transport_matrix(theta, phi, identity.masses, masses)
             warped = transport @ source
         return Transfer(self._refined(warped, identity), warped, transport)
 
-    def _described(self, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the target's features and both meshes' features of unit length."""
+    def _described(self, source: Tensor, target: Tensor) -> tuple[Identity, Tensor, Tensor, Tensor | None]:
+        """Return the target's features, both meshes' features of unit length, and the masses of the source."""
         check_pair(source, target, self.theta.weight.dtype)
         with full_precision(source):
-            identity = self.features(target)
-            theta, phi = self.theta(identity), self.phi(self.features(source))
-            return identity, unit_length(theta), unit_length(phi)
+            targets, sources = (masses_by(self.norm_weights, mesh) for mesh in (target, source))
+            identity = self.features(target, targets)
+            theta, phi = self.theta(identity), self.phi(self.features(source, sources))
+            return Identity.of(identity, targets), unit_length(theta), unit_length(phi), sources
 
-    def _refined(self, warped: Tensor, identity: Tensor) -> Tensor:
+    def _refined(self, warped: Tensor, identity: Identity) -> Tensor:
         return with_zero_gradients(self.generator(warped, identity), self.features.dead_biases())
 
 
@@ -167,15 +176,15 @@ class VertexFeatures(nn.Module):
         inner = [layer for block in self.blocks for layer in (block.linear1, block.linear2)]
         return [cast(nn.Linear, layer).bias for layer in (*self.layers, *inner)]
 
-    def forward(self, vertices: Tensor) -> Tensor:
-        """Return ``[b, n, widths[-1]]`` for ``[b, n, 3]``."""
+    def forward(self, vertices: Tensor, masses: Tensor | None) -> Tensor:
+        """Return ``[b, n, widths[-1]]`` for ``[b, n, 3]`` of masses ``[b, n, 1]``."""
         first, *others = (cast(nn.Linear, layer) for layer in self.layers)
-        hidden = _normed_linear(first, vertices)
+        hidden = _normed_linear(first, vertices, masses)
         for layer in others:
-            hidden = _normed_linear(layer, nn.functional.leaky_relu(hidden, SLOPE))
+            hidden = _normed_linear(layer, nn.functional.leaky_relu(hidden, SLOPE), masses)
         hidden = unit_length(hidden - hidden.mean(dim=2, keepdim=True) if self.centre else hidden)
         for block in self.blocks:
-            hidden = block(hidden)
+            hidden = block(hidden, masses)
         return hidden
 
 
@@ -187,10 +196,10 @@ class ResidualBlock(nn.Module):
         self.linear1, self.linear2 = nn.Linear(width, width), nn.Linear(width, width)
         self.activation = nn.PReLU()
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor, masses: Tensor | None) -> Tensor:
         """Return ``[b, n, c]`` for ``[b, n, c]``."""
-        inner = self.activation(_normed_linear(self.linear1, features))
-        return cast(Tensor, self.activation(features + _normed_linear(self.linear2, inner)))
+        inner = self.activation(_normed_linear(self.linear1, features, masses))
+        return cast(Tensor, self.activation(features + _normed_linear(self.linear2, inner, masses)))
 
 
 def unit_length(features: Tensor) -> Tensor:
@@ -198,11 +207,11 @@ def unit_length(features: Tensor) -> Tensor:
     return features / (torch.linalg.vector_norm(features, dim=2, keepdim=True) + sys.float_info.epsilon)
 
 
-def _normed_linear(layer: nn.Linear, features: Tensor) -> Tensor:
+def _normed_linear(layer: nn.Linear, features: Tensor, masses: Tensor | None) -> Tensor:
     """Return the instance norm (biased variance) of the layer's output, which its bias does not change."""
     hidden = nn.functional.linear(features, layer.weight)
-    hidden = hidden - hidden.mean(dim=1, keepdim=True)
-    return hidden * torch.rsqrt(hidden.square().mean(dim=1, keepdim=True) + VARIANCE_FLOOR)
+    hidden = hidden - vertex_mean(hidden, masses)
+    return hidden * torch.rsqrt(vertex_mean(hidden.square(), masses) + VARIANCE_FLOOR)
 
 
 def _initialise(network: CoreNet3D) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
 
 from training.networks.layers.autocast_centering import centred_for_autocast
-from training.networks.layers.input_checks import check_vertices
+from training.networks.layers.input_checks import check_norm_weights, check_vertices
 from training.networks.layers.modulation import (
     FFAdaIN,
     full_precision,
@@ -19,6 +19,7 @@ from training.networks.layers.modulation import (
     with_zero_gradients,
 )
 from training.networks.layers.pose_encoder import PoseEncoder, centred_features, normalised_linear
+from training.networks.layers.sampling import masses_by
 
 
 class DSFFNet(nn.Module):
@@ -41,6 +42,9 @@ class DSFFNet(nn.Module):
         False is the ablation "w/o side target": every FFAdaIN keeps its mixed branch only.
     initial_mixing
         Initial alpha and beta of every FFAdaIN: 0 is the paper's.
+    norm_weights
+        How much vertices count in instance norms: ``"uniform"``, all the same, as in the paper; ``"area"``, by the area
+        around them, so that it matters less how densely vertices lie.
 
     Notes
     -----
@@ -75,9 +79,12 @@ class DSFFNet(nn.Module):
         feature_fusion: bool = True,
         target_side: bool = True,
         initial_mixing: float = 0.0,
+        norm_weights: Literal["uniform", "area"] = "uniform",
     ) -> None:
         super().__init__()
         _check_options(encoder_widths, decoder_widths, feature_fusion, target_side)
+        check_norm_weights(norm_weights)
+        self.norm_weights = norm_weights
         self.encoder = PoseEncoder(tuple(encoder_widths))
         self.decoder = Decoder(tuple(decoder_widths), encoder_widths[-1], feature_fusion, target_side)
         for name, parameter in self.named_parameters():
@@ -105,7 +112,7 @@ class DSFFNet(nn.Module):
             If shape or dtype does not fit.
         """
         check_vertices("source", source, self.decoder.lift.weight.dtype)
-        return cast(Tensor, self.encoder(source))
+        return cast(Tensor, self.encoder(source, masses_by(self.norm_weights, source)))
 
     def decode(self, *, latent: Tensor, target: Tensor) -> Tensor:
         """Return the target ``[b, n_target, 3]`` in the poses `latent` of `encode`.
@@ -120,7 +127,8 @@ class DSFFNet(nn.Module):
         if list(latent.shape) != expected:
             raise ValueError(f"one pose a target: latent must be {expected}, got {list(latent.shape)}")
         unused = [layer.bias for layer in (*self.encoder.linear_layers(), *self.decoder.before_norm())]
-        return with_zero_gradients(self.decoder(latent, target), unused)
+        moved = self.decoder(latent, target, masses_by(self.norm_weights, target))
+        return with_zero_gradients(moved, unused)
 
     def adaptive_coefficients(self) -> dict[str, float]:
         """Return alpha (of scales) and beta (of shifts) of every FFAdaIN by name: the weight of the mixed branch."""
@@ -144,7 +152,7 @@ class ResidualBlock(nn.Module):
         self.linear1 = nn.Linear(width, width)
         self.linear2 = nn.Linear(width, width)
 
-    def forward(self, active: Tensor, vertices: Tensor, probe: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, active: Tensor, vertices: Tensor, probe: Tensor, masses: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return, after the first FFAdaIN and ReLU, the first summand without bias and what the second layer acts on.
 
         The rest is left to what follows the block, which has cheaper ways of doing it (see `joined`). Without
@@ -152,7 +160,7 @@ class ResidualBlock(nn.Module):
         """
         active = centred_for_autocast(active)
         first = nn.functional.linear(active, self.linear1.weight)
-        return first, rounded_modulated_relu(first, vertices, *self.norm2(probe), room=active)
+        return first, rounded_modulated_relu(first, vertices, *self.norm2(probe), room=active, masses=masses)
 
 
 class Decoder(nn.Module):
@@ -175,30 +183,30 @@ class Decoder(nn.Module):
         inner = [layer for block in blocks for layer in (block.linear1, block.linear2)]
         return [self.lift, *inner, self.linear2, self.linear3]
 
-    def forward(self, latent: Tensor, target: Tensor) -> Tensor:
-        """Return ``[b, n, 3]`` for ``[b, latent]`` and ``[b, n, 3]``."""
+    def forward(self, latent: Tensor, target: Tensor, masses: Tensor | None) -> Tensor:
+        """Return ``[b, n, 3]`` for ``[b, latent]``, ``[b, n, 3]`` and the vertices' masses ``[b, n, 1]`` or None."""
         vertices = homogeneous(target)
         with full_precision(target):
             probe = pose_probe(latent)
-            active = self.lifted(target, vertices, probe)
+            active = self.lifted(target, vertices, probe, masses)
         for block, following, norm in (
             (self.block1, self.linear2, self.block2.norm1),
             (self.block2, self.linear3, self.block3.norm1),
         ):
-            first, second = block(active, vertices, probe)
+            first, second = block(active, vertices, probe, masses)
             modulate = rounded_modulated_relu if norm is self.block2.norm1 else modulated_relu
             merged = joined(first, second, block.linear2.weight, following.weight)
-            active = modulate(merged, vertices, *norm(probe), room=merged)
+            active = modulate(merged, vertices, *norm(probe), room=merged, masses=masses)
             del merged
         with full_precision(target):  # rounding in the last block, the cheapest, would show in the output as it is
-            first, second = self.block3(active, vertices, probe)
+            first, second = self.block3(active, vertices, probe, masses)
             return 2 * torch.tanh(self._lowered(first, second))
 
-    def lifted(self, target: Tensor, vertices: Tensor, probe: Tensor) -> Tensor:
+    def lifted(self, target: Tensor, vertices: Tensor, probe: Tensor, masses: Tensor | None = None) -> Tensor:
         """Return the first layer, FFAdaIN and ReLU: ``IN(h) sigma + mu`` is quadratic in the coordinates."""
         scale, shift = self.block1.norm1(probe)
-        centred = centred_features(target)
-        line = normalised_linear(self.lift.weight, centred)
+        centred = centred_features(target, masses)
+        line = normalised_linear(self.lift.weight, centred, masses)
         monomials = (centred.unsqueeze(3) * vertices.unsqueeze(2)).flatten(2)
         coefficients = (line.unsqueeze(2) * scale.unsqueeze(1)).flatten(1, 2)
         if torch.compiler.is_compiling():  # Inductor lays vertices into the concatenation, with one mesh's strides

@@ -7,7 +7,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.layers.input_checks import check_vertices
+from training.networks.layers.input_checks import check_norm_weights, check_vertices
 from training.networks.layers.modulation import (
     affine_map,
     full_precision,
@@ -18,6 +18,7 @@ from training.networks.layers.modulation import (
     with_zero_gradients,
 )
 from training.networks.layers.pose_encoder import PoseEncoder
+from training.networks.layers.sampling import masses_by
 
 WEIGHT_DEVIATION = 0.02
 """Standard deviation of the initial weights (NPT, released ``utils.weights_init``)."""
@@ -41,6 +42,9 @@ class NPT(nn.Module):
     encoder_widths
         Channels after each layer of the pose encoder; the last is the length of ``z``. The decoder's blocks have
         ``last + 3``, and a half and a quarter of that, rounded down.
+    norm_weights
+        How much vertices count in instance norms: ``"uniform"``, all the same, as published; ``"area"``, by the area
+        around them, so that it matters less how densely vertices lie.
 
     Notes
     -----
@@ -76,13 +80,15 @@ class NPT(nn.Module):
         *,
         variant: Literal["maxpool", "origin"] = "maxpool",
         encoder_widths: tuple[int, int, int] = (64, 128, 1024),
+        norm_weights: Literal["uniform", "area"] = "uniform",
     ) -> None:
         super().__init__()
         if variant not in ("maxpool", "origin"):
             raise ValueError(f"variant must be 'maxpool' or 'origin', got {variant!r}")
         if len(encoder_widths) != 3 or min(encoder_widths) < 1:
             raise ValueError(f"encoder_widths must be three positive integers, got {encoder_widths}")
-        self.variant = variant
+        check_norm_weights(norm_weights)
+        self.variant, self.norm_weights = variant, norm_weights
         self.encoder = PoseEncoder(tuple(encoder_widths))
         self.decoder = Decoder(encoder_widths[-1], pooled=variant == "maxpool")
         for layer in self.modules():
@@ -115,7 +121,8 @@ class NPT(nn.Module):
             If shape or dtype does not fit.
         """
         check_vertices("source", source, self.decoder.lift.weight.dtype)
-        return cast(Tensor, self.encoder(source) if self.variant == "maxpool" else self.encoder.features(source))
+        encode = self.encoder if self.variant == "maxpool" else self.encoder.features
+        return cast(Tensor, encode(source, masses_by(self.norm_weights, source)))
 
     def decode(self, *, latent: Tensor, target: Tensor) -> Tensor:
         """Return the target ``[b, n_target, 3]`` in the poses `latent` of `encode`.
@@ -130,7 +137,8 @@ class NPT(nn.Module):
         if list(latent.shape) != expected:
             raise ValueError(f"one pose a target: latent must be {expected}, got {list(latent.shape)}")
         unused = [layer.bias for layer in (*self.encoder.linear_layers(), *self.decoder.before_norm())]
-        return with_zero_gradients(self.decoder(latent, target), unused)
+        moved = self.decoder(latent, target, masses_by(self.norm_weights, target))
+        return with_zero_gradients(moved, unused)
 
 
 class SPAdaIN(nn.Module):
@@ -156,13 +164,13 @@ class ResidualBlock(nn.Module):
         self.linear1, self.linear2 = nn.Linear(width, width), nn.Linear(width, width)
         self.linear_residual = nn.Linear(width, width)
 
-    def forward(self, hidden: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, hidden: Tensor, vertices: Tensor, masses: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return what the last layers of the two branches act on; these are merged with what follows (`followed`)."""
         meshes = vertices.shape[0]
-        first = modulated_relu(hidden, vertices, *self.norm1(meshes))
+        first = modulated_relu(hidden, vertices, *self.norm1(meshes), masses=masses)
         second = nn.functional.linear(first, self.linear1.weight)
-        residual = modulated_relu(hidden, vertices, *self.norm_residual(meshes))
-        return modulated_relu(second, vertices, *self.norm2(meshes)), residual
+        residual = modulated_relu(hidden, vertices, *self.norm_residual(meshes), masses=masses)
+        return modulated_relu(second, vertices, *self.norm2(meshes), masses=masses), residual
 
     def followed(self, weight: Tensor, branches: tuple[Tensor, Tensor]) -> Tensor:
         """Return ``weight @ block``, less its constant: `weight` has fewer rows than columns, so merging is cheaper."""
@@ -175,8 +183,10 @@ class ResidualBlock(nn.Module):
 class PooledBlock(ResidualBlock):
     """The first block of "maxpool": without instance norms, its input is known as one affine map a mesh."""
 
-    def forward(self, line: Tensor, vertices: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, line: Tensor, vertices: Tensor, masses: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the same for ``hidden = vertices @ line``, `line` ``[b, 4, c]``; less constants, as a norm follows.
+
+        There is no norm in it, and no use for masses.
 
         A feature may vary far less over the vertices than it is large, more than a 16-bit number can hold. So products
         act on what varies, and constants are added in full precision.
@@ -228,12 +238,12 @@ class Decoder(nn.Module):
         ends = [layer for block in (self.block1, self.block2) for layer in (block.linear2, block.linear_residual)]
         return [*normed, *ends, *([] if isinstance(self.block1, PooledBlock) else [self.lift, self.block1.linear1])]
 
-    def forward(self, latent: Tensor, target: Tensor) -> Tensor:
-        """Return ``[b, n, 3]`` for the latent, ``[b, c]`` or ``[b, n, c]``, and ``[b, n, 3]``."""
+    def forward(self, latent: Tensor, target: Tensor, masses: Tensor | None) -> Tensor:
+        """Return ``[b, n, 3]`` for the latent, ``[b, c]`` or ``[b, n, c]``, and ``[b, n, 3]`` of these masses."""
         vertices = homogeneous(target)
-        branches = self.block1(self._lifted(latent, target), vertices)
-        branches = self.block2(self.block1.followed(self.linear2.weight, branches), vertices)
-        branches = self.block3(self.block2.followed(self.linear3.weight, branches), vertices)
+        branches = self.block1(self._lifted(latent, target), vertices, masses)
+        branches = self.block2(self.block1.followed(self.linear2.weight, branches), vertices, masses)
+        branches = self.block3(self.block2.followed(self.linear3.weight, branches), vertices, masses)
         with full_precision(target):
             inner = self.block3.linear2.bias + self.block3.linear_residual.bias
             moved = self.block3.followed(self.out.weight, branches)

@@ -7,6 +7,10 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from datagen.recipe import Frozen
 
 Widths = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+NormWeights = Annotated[
+    Literal["uniform", "area"],
+    Field(description="how much vertices count in norms: all the same (as published), or by the area around them"),
+]
 
 
 class DsffnetRecipe(Frozen):
@@ -20,6 +24,7 @@ class DsffnetRecipe(Frozen):
     initial_mixing: float = Field(
         0.0, ge=-1, le=2, description="alpha and beta of every FFAdaIN at first: 0 all target side (paper), 1 all mixed"
     )
+    norm_weights: NormWeights = "uniform"
 
     @model_validator(mode="after")
     def _something_modulates(self) -> "DsffnetRecipe":
@@ -39,6 +44,7 @@ class NptRecipe(Frozen):
         description="maxpool: one pose vector a mesh; origin: one a vertex, source and target paired by index",
     )
     encoder_widths: Widths = Field((64, 128, 1024), description="channels of the pose encoder; the decoder's follow")
+    norm_weights: NormWeights = "uniform"
 
 
 def _with_network_name(values: Any) -> Any:
@@ -56,6 +62,7 @@ class CoreNet3dRecipe(Frozen):
     feature_widths: Widths = Field((64, 128, 256), description="channels of the vertex features' layers")
     generator_widths: Widths = Field((1024, 512, 256), description="channels of the generator's three blocks")
     centre_features: bool = Field(False, description="centre features over channels before they are compared")
+    norm_weights: NormWeights = "uniform"
 
 
 class PartsRecipe(Frozen):

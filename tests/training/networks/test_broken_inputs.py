@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.support.three_networks import FORMS, initial, lively, meshes, pair
+from tests.support.three_networks import BY_AREA, FORMS, initial, lively, meshes, pair
 from training.networks.dsffnet import DSFFNet
 from training.networks.layers import modulation
 from training.networks.layers import optimal_transport as correspondence
@@ -27,7 +27,7 @@ def _assert_only_the_second_pair_breaks(network: nn.Module, inputs: dict[str, Te
             torch.testing.assert_close(output[0], sound[0], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS, *BY_AREA])
 @pytest.mark.parametrize("name", ["source", "target"])
 @pytest.mark.parametrize("value", BROKEN)
 @pytest.mark.parametrize("start", [initial, lively])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.support.three_networks import FORMS, lively, loss_gradients, meshes, pair
+from tests.support.three_networks import BY_AREA, FORMS, lively, loss_gradients, meshes, pair
 from training.networks.dsffnet import DSFFNet
 
 pytestmark = pytest.mark.slow
@@ -17,7 +17,7 @@ def _fresh_compiler() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS, *BY_AREA])
 def test_compiled_inference_gives_the_same_output_for_other_vertex_numbers(form: str) -> None:
     network = lively(form).eval()
     compiled = torch.compile(network, dynamic=True)
@@ -39,9 +39,10 @@ def test_a_broken_coordinate_makes_its_pair_nan_and_no_other_compiled(form: str)
         torch.testing.assert_close(output[0], sound[0], rtol=1e-4, atol=1e-5)
 
 
-def test_compiled_gradients_of_dsffnet_equal_the_eager_ones_for_other_vertex_numbers() -> None:
+@pytest.mark.parametrize("norm_weights", ["uniform", "area"])
+def test_compiled_gradients_of_dsffnet_equal_the_eager_ones_for_other_vertex_numbers(norm_weights: str) -> None:
     torch.manual_seed(0)
-    network = DSFFNet(encoder_widths=(8, 16, 24), decoder_widths=(16, 32, 16))
+    network = DSFFNet(encoder_widths=(8, 16, 24), decoder_widths=(16, 32, 16), norm_weights=norm_weights)
     for name, parameter in network.named_parameters():
         if name.endswith(("alpha", "beta")):
             torch.nn.init.uniform_(parameter, -1, 1)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.support.three_networks import FORMS, PAIRING, lively
+from tests.support.three_networks import BY_AREA, FORMS, PAIRING, lively, plain
 from training.networks.padded_batches import MixedCounts
 
 COUNTS = ([40, 31, 40, 7], [25, 50, 25, 50])
@@ -19,9 +19,9 @@ def padded(counts: list[int], seed: int) -> torch.Tensor:
     return meshes
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS, *BY_AREA])
 def test_each_mesh_gets_what_it_gets_alone(form: str) -> None:
-    network, counts = lively(form).eval(), COUNTS if form != PAIRING else (COUNTS[1], COUNTS[1])
+    network, counts = lively(form).eval(), COUNTS if plain(form) != PAIRING else (COUNTS[1], COUNTS[1])
     source, target = padded(counts[0], 1), padded(counts[1], 2)
     together = MixedCounts(network)(source=source, target=target, source_counts=counts[0], target_counts=counts[1])
     assert together.shape == target.shape

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.support.three_networks import FORMS, LITERAL, fitted, initial, lively, loss_gradients, pair
+from tests.support.three_networks import BY_AREA, FORMS, LITERAL, fitted, initial, lively, loss_gradients, pair
 from training.networks.corenet3d import CoreNet3D
 from training.networks.layers.pose_encoder import PoseEncoder
 
@@ -145,7 +145,7 @@ def test_gradients_under_autocast_are_those_of_float32_and_nearer_than_the_plain
     assert error < _rounded(LITERAL[form](network), inputs)[0]
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS, *BY_AREA])
 def test_every_parameter_gets_a_finite_float32_gradient_under_autocast(form: str) -> None:
     network = lively(form)
     with torch.autocast("cpu", torch.bfloat16):

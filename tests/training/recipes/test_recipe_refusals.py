@@ -29,6 +29,8 @@ ORIGIN = {"name": "npt", "variant": "origin"}
             {"augmentation": {"proportions": 0.2}},
             "needs the parts that network 'parts' is told of, but the network is 'dsffnet': set augmentation",
         ),
+        ({"network": {"name": "parts", "norm_weights": "area"}}, "Extra inputs are not permitted"),
+        ({"network": {"norm_weights": "mass"}}, "Input should be 'uniform' or 'area'"),
         (
             {"early_stopping": 3, "steps": 400},
             "with evaluate_every 500 there is none before the last of 400 steps: set evaluate_every lower",

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
 from torch.nn.utils.parametrize import ParametrizationList
 
-from training.networks.layers.modulation import full_precision
+from training.networks.layers.modulation import full_precision, vertex_mean
 
 VARIANCE_FLOOR = 1e-5
 """Added to the variance in ElaIN (released code)."""
@@ -34,22 +34,24 @@ class Centred(NamedTuple):
     """``[b, 1, c]``, standard deviation over the vertices."""
 
 
-def centred(features: Tensor, constant: Tensor) -> Centred:
-    """Take ``features + constant`` apart, ``[b, n, c]`` and ``[c]``.
+def centred(features: Tensor, constant: Tensor, masses: Tensor | None = None) -> Centred:
+    """Take ``features + constant`` apart, ``[b, n, c]`` and ``[c]``; vertices count by their masses (`Identity`).
 
     The constant goes to the mean alone: added to features in 16 bits, it and its gradient would drown in rounding.
     """
-    mean = features.mean(dim=1, keepdim=True)
-    return with_deviation(features - mean, mean + constant)
+    mean = vertex_mean(features, masses)
+    return with_deviation(features - mean, mean + constant, masses)
 
 
-def with_deviation(values: Tensor, mean: Tensor) -> Centred:
+def with_deviation(values: Tensor, mean: Tensor, masses: Tensor | None) -> Centred:
     """Add the deviation to centred values.
 
     The variance is the unbiased one, as in the released code (unlike an instance norm's). A single vertex has none in
     it; here its deviation is that of a constant channel, so that it is moved to a finite place.
     """
-    variance = values.square().sum(dim=1, keepdim=True) / max(values.shape[1] - 1, 1)
+    squares, count = values.square(), values.shape[1]
+    total = squares.sum(dim=1, keepdim=True) if masses is None else count * vertex_mean(squares, masses)
+    variance = total / max(count - 1, 1)
     return Centred(values, mean, torch.sqrt(variance + VARIANCE_FLOOR))
 
 
@@ -60,12 +62,14 @@ class Identity(NamedTuple):
     """``[b, n, k + 1]``, the last channel one."""
     mean: Tensor
     """``[b, 1, k + 1]``, over the vertices."""
+    masses: Tensor | None
+    """``[b, n, 1]``, how much each vertex counts in means and deviations, in sum one; None: equally."""
 
     @classmethod
-    def of(cls, features: Tensor) -> Identity:
+    def of(cls, features: Tensor, masses: Tensor | None = None) -> Identity:
         """Make it from ``[b, n, k]`` features."""
         extended = nn.functional.pad(features, (0, 1), value=1.0)
-        return cls(extended, extended.mean(dim=1, keepdim=True))
+        return cls(extended, vertex_mean(extended, masses), masses)
 
 
 class ElaIN(nn.Module):
@@ -136,7 +140,7 @@ class ElaINBlock(nn.Module):
             weight = cast(Tensor, self.linear0.weight)
         hidden = nn.functional.linear(active, weight)
         with full_precision(hidden):
-            inner = centred(hidden.to(features.values.dtype), cast(Tensor, self.linear0.bias))
+            inner = centred(hidden.to(features.values.dtype), cast(Tensor, self.linear0.bias), identity.masses)
         return skipped, nn.functional.leaky_relu_(self.norm1(inner, identity), SLOPE)
 
     def followed_by(self, following: nn.Linear, skipped: Tensor, inner: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,27 +194,27 @@ class Generator(nn.Module):
         self.block3 = ElaINBlock(third, identity)
         self.out = nn.Linear(third, 3)
 
-    def forward(self, warped: Tensor, identity: Tensor) -> Tensor:
-        """Return ``[b, n, 3]`` for warped points ``[b, n, 3]`` and the target's features ``[b, n, k]``."""
+    def forward(self, warped: Tensor, identity: Identity) -> Tensor:
+        """Return ``[b, n, 3]`` for warped points ``[b, n, 3]`` and the target's features."""
         with full_precision(warped):
-            side, features = Identity.of(identity), self.lifted(warped)
+            features = self.lifted(warped, identity.masses)
         for block, following in ((self.block1, self.linear2), (self.block2, self.linear3)):
-            hidden, bias = block.followed_by(following, *block(features, side))
+            hidden, bias = block.followed_by(following, *block(features, identity))
             with full_precision(warped):
-                features = centred(hidden.to(warped.dtype), bias)
-        active = self.block3(features, side)
+                features = centred(hidden.to(warped.dtype), bias, identity.masses)
+        active = self.block3(features, identity)
         with full_precision(warped):
             skipped, inner = (part.to(warped.dtype) for part in active)
             moved, bias = self.block3.followed_by(self.out, skipped, inner)
             return 2 * torch.tanh(moved + bias)
 
-    def lifted(self, warped: Tensor) -> Centred:
+    def lifted(self, warped: Tensor, masses: Tensor | None = None) -> Centred:
         """Return the first two layers' output: one linear map of nine numbers, so that centring those centres it."""
         weight = self.linear1.weight @ self.lift.weight
         bias = self.linear1.weight @ self.lift.bias + self.linear1.bias
         window = neighbour_window(warped)
-        mean = window.mean(dim=1, keepdim=True)
-        return with_deviation((window - mean) @ weight.t(), nn.functional.linear(mean, weight, bias))
+        mean = vertex_mean(window, masses)
+        return with_deviation((window - mean) @ weight.t(), nn.functional.linear(mean, weight, bias), masses)
 
 
 def neighbour_window(vertices: Tensor) -> Tensor:

@@ -39,6 +39,12 @@ def check_pair(source: Tensor, target: Tensor, dtype: torch.dtype) -> None:
         )
 
 
+def check_norm_weights(name: str) -> None:
+    """Raise ValueError unless `name` says how much vertices count in norms."""
+    if name not in ("uniform", "area"):
+        raise ValueError(f"norm_weights must be 'uniform' or 'area', got {name!r}")
+
+
 def _check_precision(name: str, dtype: torch.dtype) -> None:
     if dtype.is_floating_point and dtype not in PRECISIONS:
         raise ValueError(

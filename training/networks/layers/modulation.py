@@ -23,6 +23,16 @@ CHUNK_ELEMENTS = 2**17
 """On a CPU, elements of an array worked on at a time: half a mebibyte of float32, so that temporaries stay in cache."""
 
 
+def vertex_mean(features: Tensor, masses: Tensor | None) -> Tensor:
+    """Return the mean ``[b, 1, c]`` of ``[b, n, c]`` over the vertices, each of its mass ``[b, n, 1]``; None: equal."""
+    return features.mean(dim=1, keepdim=True) if masses is None else masses.mT @ features
+
+
+def total_mass(features: Tensor, masses: Tensor | None) -> int:
+    """Return what the weights of the vertices of ``[b, n, c]`` add up to: one, or `n` where each counts as one."""
+    return features.shape[1] if masses is None else 1
+
+
 def homogeneous(coordinates: Tensor) -> Tensor:
     """Append a one to every vertex: ``[b, n, 3]`` to ``[b, n, 4]``."""
     return nn.functional.pad(coordinates, (0, 1), value=1.0)
@@ -115,6 +125,7 @@ def modulated_relu(
     *,
     normalised: bool = True,
     room: Tensor | None = None,
+    masses: Tensor | None = None,
 ) -> Tensor:
     """Return ``relu(IN(hidden) * sigma + mu)``.
 
@@ -131,6 +142,8 @@ def modulated_relu(
     room
         An array that is not needed any more, `hidden` itself perhaps: where no gradient is wanted, the result may take
         its place, as fresh memory costs as much time as the arithmetic.
+    masses
+        ``[b, n, 1]``, how much each vertex counts in the norm, in sum one, taken for constants; None: equally.
 
     Returns
     -------
@@ -141,16 +154,23 @@ def modulated_relu(
     with full_precision(hidden):
         if not torch.compiler.is_compiling():
             room = _usable(room, hidden)
-            return cast(Tensor, _ModulatedRelu.apply(hidden, vertices, scale, shift, normalised, room))  # type: ignore[no-untyped-call]
+            given = hidden, vertices, scale, shift, normalised, room, masses
+            return cast(Tensor, _ModulatedRelu.apply(*given))  # type: ignore[no-untyped-call]
         # A compiler fuses the plain expression, and could not unroll an unknown number of chunks.
         if normalised:
-            hidden = hidden - hidden.mean(dim=1, keepdim=True)
-            scale = scale * torch.rsqrt(hidden.square().mean(dim=1, keepdim=True) + VARIANCE_FLOOR)
+            hidden = hidden - vertex_mean(hidden, masses)
+            scale = scale * torch.rsqrt(vertex_mean(hidden.square(), masses) + VARIANCE_FLOOR)
         return torch.relu(hidden * (vertices @ scale) + vertices @ shift)
 
 
 def rounded_modulated_relu(
-    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, *, room: Tensor | None = None
+    hidden: Tensor,
+    vertices: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    *,
+    room: Tensor | None = None,
+    masses: Tensor | None = None,
 ) -> Tensor:
     """Return `modulated_relu` as `rounding.centred_for_autocast` then takes it, in fewer passes over memory.
 
@@ -159,9 +179,9 @@ def rounded_modulated_relu(
     """
     plain = torch.is_grad_enabled() or torch.compiler.is_compiling()
     if plain or hidden.dtype == vertices.dtype or hidden.device.type != "cpu":
-        return centred_for_autocast(modulated_relu(hidden, vertices, scale, shift, room=room))
+        return centred_for_autocast(modulated_relu(hidden, vertices, scale, shift, room=room, masses=masses))
     with full_precision(hidden):
-        return _rounded_modulated_relu(hidden, vertices, scale, shift, _usable(room, hidden))
+        return _rounded_modulated_relu(hidden, vertices, scale, shift, _usable(room, hidden), masses)
 
 
 def _usable(room: Tensor | None, hidden: Tensor) -> Tensor | None:
@@ -171,9 +191,9 @@ def _usable(room: Tensor | None, hidden: Tensor) -> Tensor | None:
 
 
 def _rounded_modulated_relu(
-    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, room: Tensor | None
+    hidden: Tensor, vertices: Tensor, scale: Tensor, shift: Tensor, room: Tensor | None, masses: Tensor | None
 ) -> Tensor:
-    mean, deviation = _statistics(hidden, vertices.dtype)
+    mean, deviation = _statistics(hidden, vertices.dtype, masses)
     scaled = scale * deviation
     sample = (hidden[:, ::SAMPLED] - mean).mul_(vertices[:, ::SAMPLED] @ scaled).add_(vertices[:, ::SAMPLED] @ shift)
     constant = sample.clamp_min_(0).mean(dim=1, keepdim=True)
@@ -200,9 +220,10 @@ class _ModulatedRelu(torch.autograd.Function):
         shift: Tensor,
         normalised: bool,
         room: Tensor | None,
+        masses: Tensor | None,
     ) -> Tensor:
         ctx.normalised = normalised
-        mean, deviation = _statistics(hidden, hidden.dtype) if normalised else _no_statistics(hidden)
+        mean, deviation = _statistics(hidden, hidden.dtype, masses) if normalised else _no_statistics(hidden)
         scaled = scale * deviation
         output = torch.empty_like(hidden) if room is None else room
         centred, sigma = _scratch(hidden), _scratch(hidden)
@@ -211,13 +232,13 @@ class _ModulatedRelu(torch.autograd.Function):
             product = torch.bmm(rows, scaled, out=sigma[:, : rows.shape[1]])
             product.mul_(torch.sub(hidden[:, chunk], mean, out=centred[:, : rows.shape[1]]))
             torch.clamp_min(product.baddbmm_(rows, shift), 0, out=part)
-        ctx.save_for_backward(hidden, output, vertices, scale, shift, mean, deviation)
+        ctx.save_for_backward(hidden, output, vertices, scale, shift, mean, deviation, masses)
         return output
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_output: Tensor) -> tuple[Tensor | None, ...]:
-        hidden, output, vertices, scale, shift, mean, deviation = ctx.saved_tensors
+        hidden, output, vertices, scale, shift, mean, deviation, masses = ctx.saved_tensors
         gradient, grad_shift, grad_scaled = _masked_sums(grad_output, hidden, output, vertices, mean)
         grad_scale = grad_scaled * deviation
         grad_vertices = None
@@ -226,16 +247,16 @@ class _ModulatedRelu(torch.autograd.Function):
             grad_vertices = gradient @ shift.transpose(1, 2) + weighted @ scale.transpose(1, 2)
         # The derivative of an instance norm removes mean(d) and mean(d * IN(h)), d = gradient * sigma. Both are sums of
         # four products: sigma is vertices @ scale, and the sums against the four coordinates are known.
-        share = 4 / hidden.shape[1] if ctx.normalised else 0.0
+        share = 4 / total_mass(hidden, masses) if ctx.normalised else 0.0
         along_one = (scale * grad_shift).mean(dim=1, keepdim=True) * share * deviation
         along_hidden = (scale * grad_scale).mean(dim=1, keepdim=True) * share * deviation.square()
         _normalisation_gradient(
-            gradient, hidden, vertices, scale * deviation, mean * along_hidden - along_one, -along_hidden
+            gradient, hidden, vertices, scale * deviation, mean * along_hidden - along_one, -along_hidden, masses
         )
-        return gradient, grad_vertices, grad_scale, grad_shift, None, None
+        return gradient, grad_vertices, grad_scale, grad_shift, None, None, None
 
 
-def _statistics(hidden: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def _statistics(hidden: Tensor, dtype: torch.dtype, masses: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return mean and ``1 / sqrt(Var + eps)`` over the vertices, ``[b, 1, c]`` in `dtype`, in one pass.
 
     Squares are summed about the mean of a few vertices, and by how much that is not the mean of all is found on the
@@ -244,7 +265,8 @@ def _statistics(hidden: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """
     count = hidden.shape[1]
     about = hidden[:, ::SAMPLED].to(dtype).mean(dim=1, keepdim=True)
-    ones, scratch = about.new_ones(1, 1, 1).expand(hidden.shape[0], 1, count), _scratch(hidden, about)
+    weights = about.new_ones(1, 1, 1).expand(hidden.shape[0], 1, count) if masses is None else masses.mT
+    total, scratch = total_mass(hidden, masses), _scratch(hidden, about)
     rest, squares = torch.zeros_like(about, dtype=torch.float64), torch.zeros_like(about, dtype=torch.float64)
     for chunk in _chunks(hidden):
         part = scratch[:, : len(range(count)[chunk])]
@@ -253,10 +275,10 @@ def _statistics(hidden: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
             if hidden.dtype != dtype
             else torch.sub(hidden[:, chunk], about, out=part)
         )
-        rest += torch.bmm(ones[:, :, chunk], centred)
-        squares += torch.bmm(ones[:, :, chunk], centred.square_())
-    rest /= count
-    deviation = torch.rsqrt(squares / count - rest.square() + VARIANCE_FLOOR)
+        rest += torch.bmm(weights[:, :, chunk], centred)
+        squares += torch.bmm(weights[:, :, chunk], centred.square_())
+    rest /= total
+    deviation = torch.rsqrt(squares / total - rest.square() + VARIANCE_FLOOR)
     return (about + rest).to(dtype), deviation.to(dtype)
 
 
@@ -282,15 +304,23 @@ def _masked_sums(
 
 
 def _normalisation_gradient(
-    gradient: Tensor, hidden: Tensor, vertices: Tensor, scaled: Tensor, constant: Tensor, slope: Tensor
+    gradient: Tensor,
+    hidden: Tensor,
+    vertices: Tensor,
+    scaled: Tensor,
+    constant: Tensor,
+    slope: Tensor,
+    masses: Tensor | None,
 ) -> None:
-    """Replace `gradient` by ``gradient * (vertices @ scaled) + constant + slope * hidden``."""
+    """Replace `gradient` by ``gradient * (vertices @ scaled) + masses * (constant + slope * hidden)``."""
     sigma, line = _scratch(hidden), _scratch(hidden)
     for chunk in _chunks(hidden):
         rows, part = vertices[:, chunk], gradient[:, chunk]
         size = rows.shape[1]
         torch.bmm(rows, scaled, out=sigma[:, :size])
         torch.addcmul(constant, hidden[:, chunk], slope, out=line[:, :size])
+        if masses is not None:
+            line[:, :size].mul_(masses[:, chunk])
         torch.addcmul(line[:, :size], part, sigma[:, :size], out=part)
 
 

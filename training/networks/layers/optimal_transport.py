@@ -29,13 +29,16 @@ KEPT_ELEMENTS = 2**26
 BLOCK_ELEMENTS = 2**21
 """On a CPU, elements of ``K`` worked on at a time, so that a block is used twice while it is in cache."""
 
+Masses = Tensor | None
+"""Of vertices, ``[b, n, 1]`` and in sum one: a marginal of the transport; None: all the same."""
 
-def warp(theta: Tensor, phi: Tensor, points: Tensor) -> Tensor:
+
+def warp(theta: Tensor, phi: Tensor, points: Tensor, targets: Masses = None, sources: Masses = None) -> Tensor:
     """Return, for every target vertex, the mean of the source's `points` under its row of the transport matrix.
 
-    The same as ``transport_matrix(theta, phi) @ points``, but no ``n x m`` array survives the call. While it lasts,
-    forward or backward, there is one, whatever the batch; or none, if it were larger than `KEPT_ELEMENTS`: blocks of
-    its rows are then computed anew in each of the six passes over it.
+    The same as ``transport_matrix(theta, phi, targets, sources) @ points``, but no ``n x m`` array survives the call.
+    While it lasts, forward or backward, there is one, whatever the batch; or none, if it were larger than
+    `KEPT_ELEMENTS`: blocks of its rows are then computed anew in each of the six passes over it.
 
     Parameters
     ----------
@@ -43,6 +46,8 @@ def warp(theta: Tensor, phi: Tensor, points: Tensor) -> Tensor:
         ``[b, n, d]`` and ``[b, m, d]``, features of unit length.
     points
         ``[b, m, 3]``.
+    targets, sources
+        Masses of the vertices, without a gradient.
 
     Returns
     -------
@@ -50,49 +55,59 @@ def warp(theta: Tensor, phi: Tensor, points: Tensor) -> Tensor:
         ``[b, n, 3]``.
     """
     if torch.compiler.is_compiling():  # a compiler could not unroll an unknown number of blocks
-        return transport_matrix(theta, phi) @ points
-    return cast(Tensor, _Warp.apply(theta, phi, points))  # type: ignore[no-untyped-call]
+        return transport_matrix(theta, phi, targets, sources) @ points
+    return cast(Tensor, _Warp.apply(theta, phi, points, targets, sources))  # type: ignore[no-untyped-call]
 
 
-def transport_matrix(theta: Tensor, phi: Tensor) -> Tensor:
+def transport_matrix(theta: Tensor, phi: Tensor, targets: Masses = None, sources: Masses = None) -> Tensor:
     """Return the ``[b, n, m]`` transport between unit features ``[b, n, d]`` and ``[b, m, d]``; each row sums to one.
 
     The transport is ``diag(a) K diag(b)``. Its rows are divided by their sums, in which ``a`` cancels: the last update
     of ``a`` is not needed. Two such arrays are held at once if no gradient is wanted.
     """
     kernel = torch.bmm(theta, phi.transpose(1, 2)).sub_(1).div_(TEMPERATURE).exp_()
-    left = kernel.new_full((*kernel.shape[:2], 1), 1 / kernel.shape[1])
-    right = _scaling(kernel.transpose(1, 2) @ left)
+    rows, columns = _counts(theta, targets), _counts(phi, sources)
+    left = 1 / rows
+    right = _scaling(kernel.transpose(1, 2) @ left, columns)
     for _ in range(ITERATIONS - 1):
-        left = _scaling(kernel @ right)
-        right = _scaling(kernel.transpose(1, 2) @ left)
+        left = _scaling(kernel @ right, rows)
+        right = _scaling(kernel.transpose(1, 2) @ left, columns)
     unscaled = kernel * right.transpose(1, 2)
     total = kernel @ right
     return unscaled / total if unscaled.requires_grad else unscaled.div_(total)
 
 
-def _scaling(sums: Tensor) -> Tensor:
-    """Return the vector that brings rows (or columns) with these `sums`, ``[..., n, 1]``, to uniform marginals."""
-    return 1 / (sums.shape[-2] * (sums + GUARD))
+def _counts(features: Tensor, masses: Masses) -> Tensor:
+    """Return one over the marginals, ``[b, n, 1]``: of how many vertices, all of its mass, each would be one."""
+    meshes, count, _ = features.shape
+    return features.new_full((1, 1, 1), count).expand(meshes, count, 1) if masses is None else 1 / masses
+
+
+def _scaling(sums: Tensor, counts: Tensor) -> Tensor:
+    """Return the vector that brings rows (or columns) with these `sums`, ``[..., n, 1]``, to their marginals."""
+    return 1 / (counts * (sums + GUARD))
 
 
 class _Warp(torch.autograd.Function):
     """A pair of meshes at a time, so that memory does not grow with the batch; ``K`` is computed anew going back."""
 
     @staticmethod
-    def forward(ctx: Any, theta: Tensor, phi: Tensor, points: Tensor) -> Tensor:
-        solved = [_solve(*pair) for pair in zip(theta, phi, points, strict=True)]
+    def forward(ctx: Any, theta: Tensor, phi: Tensor, points: Tensor, targets: Masses, sources: Masses) -> Tensor:
+        counts = _counts(theta, targets), _counts(phi, sources)
+        solved = [_solve(*pair) for pair in zip(theta, phi, points, zip(*counts, strict=True), strict=True)]
         mixed, left, right = (torch.stack(parts) for parts in zip(*solved, strict=True))
-        ctx.save_for_backward(theta, phi, points, mixed, left, right)
+        ctx.save_for_backward(*counts, theta, phi, points, mixed, left, right)
         return mixed[..., :3] / mixed[..., 3:]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         with full_precision(gradient):  # whoever calls backward() may do so under autocast
-            found = [_gradients(*pair) for pair in zip(*ctx.saved_tensors, gradient, strict=True)]
+            targets, sources, *solved = ctx.saved_tensors
+            counts = zip(targets, sources, strict=True)
+            found = [_gradients(*pair) for pair in zip(counts, *solved, gradient, strict=True)]
         theta, phi, points = zip(*found, strict=True)
-        return torch.stack(theta), torch.stack(phi), torch.stack(points)
+        return torch.stack(theta), torch.stack(phi), torch.stack(points), None, None
 
 
 class _Kernel:
@@ -130,21 +145,21 @@ class _Kernel:
         return torch.mm(part, self.phi.t(), out=block).sub_(1).div_(TEMPERATURE).exp_()
 
 
-def _solve(theta: Tensor, phi: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _solve(theta: Tensor, phi: Tensor, points: Tensor, counts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Return weighted sums of ``(x, y, z, 1)`` by row, ``[n, 4]``, and the scalings ``a`` and ``b`` of all iterations.
 
     One pass over ``K`` serves an update of ``a`` and the product for the next update of ``b``.
     """
-    kernel = _Kernel(theta, phi)
-    left = [theta.new_full((theta.shape[0], 1), 1 / theta.shape[0])]
-    right = [_scaling(kernel.transposed_times(left[0]))]
+    kernel, (targets, sources) = _Kernel(theta, phi), counts
+    left = [1 / targets]
+    right = [_scaling(kernel.transposed_times(left[0]), sources)]
     for _ in range(ITERATIONS - 1):
         totals, sums = theta.new_empty(theta.shape[0], 1), theta.new_zeros(phi.shape[0], 1)
         for rows, block in kernel.blocks():
             totals[rows] = block @ right[-1]
-            sums.addmm_(block.t(), 1 / (theta.shape[0] * (totals[rows] + GUARD)))
-        left.append(_scaling(totals))
-        right.append(_scaling(sums))
+            sums.addmm_(block.t(), _scaling(totals[rows], targets[rows]))
+        left.append(_scaling(totals, targets))
+        right.append(_scaling(sums, sources))
     weighted, mixed = _homogeneous(points) * right[-1], theta.new_empty(theta.shape[0], 4)
     for rows, block in kernel.blocks():
         torch.mm(block, weighted, out=mixed[rows])
@@ -152,14 +167,21 @@ def _solve(theta: Tensor, phi: Tensor, points: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _gradients(
-    theta: Tensor, phi: Tensor, points: Tensor, mixed: Tensor, left: Tensor, right: Tensor, gradient: Tensor
+    counts: tuple[Tensor, Tensor],
+    theta: Tensor,
+    phi: Tensor,
+    points: Tensor,
+    mixed: Tensor,
+    left: Tensor,
+    right: Tensor,
+    gradient: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of both features and of the points for the `gradient` of the warped points, ``[n, 3]``.
 
     Every iteration reads ``K`` through products with vectors, so the gradient of ``K`` is a sum of outer products: a
     matrix of rank 13 that is multiplied out a block at a time.
     """
-    kernel, (targets, sources) = _Kernel(theta, phi), (theta.shape[0], phi.shape[0])
+    kernel, (targets, sources) = _Kernel(theta, phi), counts
     warped, total = mixed[:, :3] / mixed[:, 3:], mixed[:, 3:]
     grad_mixed = torch.cat([gradient, -(gradient * warped).sum(dim=1, keepdim=True)], dim=1) / total
     grad_weighted, vertices = kernel.transposed_times(grad_mixed), _homogeneous(points)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision
+from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, total_mass, vertex_mean
 
 ARGMAX_ELEMENTS = 2**20
 """On a CPU, elements of the last layer held at a time while its largest values are searched, to stay in cache."""
@@ -19,6 +19,8 @@ ARGMAX_ELEMENTS_ELSEWHERE = 2**28
 
 class PoseEncoder(nn.Module):
     """Linear layer, instance norm and ReLU, a width at a time, then the maximum over the vertices.
+
+    The vertices count in the norms by their masses ``[b, n, 1]``, in sum one; None: equally.
 
     Parameters
     ----------
@@ -39,34 +41,35 @@ class PoseEncoder(nn.Module):
         """Return the layers in order; their biases have no effect, since a norm follows each."""
         return [cast(nn.Linear, layer) for layer in self.layers]
 
-    def forward(self, source: Tensor) -> Tensor:
+    def forward(self, source: Tensor, masses: Tensor | None = None) -> Tensor:
         """Return ``[b, widths[-1]]`` for ``[b, n, 3]``."""
         last = self.last.weight
         searched = _search_precision(source)  # asked before autocast is switched off
         with full_precision(source):
-            centred = self._before_last(source)
-            return torch.relu(_largest(last, centred, searched) * deviation_after(last, centred))
+            centred = self._before_last(source, masses)
+            return torch.relu(_largest(last, centred, searched) * deviation_after(last, centred, masses))
 
-    def features(self, source: Tensor) -> Tensor:
+    def features(self, source: Tensor, masses: Tensor | None = None) -> Tensor:
         """Return ``[b, n, widths[-1]]``, of which `forward` is the maximum over the vertices."""
         with full_precision(source):
-            centred = self._before_last(source)
-            line = normalised_linear(self.last.weight, centred)
+            centred = self._before_last(source, masses)
+            line = normalised_linear(self.last.weight, centred, masses)
         return torch.relu(centred @ line)
 
-    def _before_last(self, source: Tensor) -> Tensor:
-        centred = centred_features(source)
+    def _before_last(self, source: Tensor, masses: Tensor | None) -> Tensor:
+        centred = centred_features(source, masses)
         for layer in self.linear_layers()[:-1]:
-            centred = centred_features(torch.relu(centred @ normalised_linear(layer.weight, centred)))
+            line = normalised_linear(layer.weight, centred, masses)
+            centred = centred_features(torch.relu(centred @ line), masses)
         return centred
 
 
-def centred_features(features: Tensor) -> Tensor:
+def centred_features(features: Tensor, masses: Tensor | None = None) -> Tensor:
     """Return ``[b, n, i]`` features less their mean over the vertices."""
-    return features - features.mean(dim=1, keepdim=True)
+    return features - vertex_mean(features, masses)
 
 
-def deviation_after(weight: Tensor, centred: Tensor) -> Tensor:
+def deviation_after(weight: Tensor, centred: Tensor, masses: Tensor | None = None) -> Tensor:
     """Return ``1 / sqrt(Var + eps)`` of the features ``weight @ x`` without computing these features.
 
     The variance of ``w . x`` is ``w' Cov(x) w``. The covariance is taken in float64: in float32 a channel whose
@@ -78,6 +81,8 @@ def deviation_after(weight: Tensor, centred: Tensor) -> Tensor:
         ``[c, i]``.
     centred
         ``[b, n, i]``, with zero mean over the vertices.
+    masses
+        ``[b, n, 1]``, how much each vertex counts, in sum one; None: equally.
 
     Returns
     -------
@@ -85,23 +90,24 @@ def deviation_after(weight: Tensor, centred: Tensor) -> Tensor:
         ``[b, c]``, in the dtype of `centred`.
     """
     if torch.compiler.is_compiling():
-        variance = _variance_after(weight, centred)[0]
+        variance = _variance_after(weight, centred, masses)[0]
     else:
-        variance = cast(Tensor, _VarianceAfter.apply(weight, centred))  # type: ignore[no-untyped-call]
+        variance = cast(Tensor, _VarianceAfter.apply(weight, centred, masses))  # type: ignore[no-untyped-call]
     return torch.rsqrt(variance + VARIANCE_FLOOR)
 
 
-def normalised_linear(weight: Tensor, centred: Tensor) -> Tensor:
+def normalised_linear(weight: Tensor, centred: Tensor, masses: Tensor | None = None) -> Tensor:
     """Return the ``[b, i, c]`` maps ``m`` for which ``centred @ m`` is the instance norm of ``weight @ x + bias``.
 
     A bias shifts the mean that the norm removes, so it has no part in this.
     """
-    return weight.t() * deviation_after(weight, centred).unsqueeze(1)
+    return weight.t() * deviation_after(weight, centred, masses).unsqueeze(1)
 
 
-def _variance_after(weight: Tensor, centred: Tensor) -> tuple[Tensor, Tensor]:
+def _variance_after(weight: Tensor, centred: Tensor, masses: Tensor | None) -> tuple[Tensor, Tensor]:
     precise, rows = centred.double(), weight.double()
-    images = rows @ (precise.transpose(1, 2) @ precise / centred.shape[1])
+    weighted = precise if masses is None else precise * masses
+    images = rows @ (precise.transpose(1, 2) @ weighted / total_mass(centred, masses))
     return (images * rows).sum(dim=2).to(centred.dtype), images.to(centred.dtype)
 
 
@@ -109,20 +115,21 @@ class _VarianceAfter(torch.autograd.Function):
     """Going back, the covariance is symmetric: one product, in the working precision, instead of two in float64."""
 
     @staticmethod
-    def forward(ctx: Any, weight: Tensor, centred: Tensor) -> Tensor:
-        variance, images = _variance_after(weight, centred)
-        ctx.save_for_backward(weight, centred, images)
+    def forward(ctx: Any, weight: Tensor, centred: Tensor, masses: Tensor | None) -> Tensor:
+        variance, images = _variance_after(weight, centred, masses)
+        ctx.save_for_backward(weight, centred, images, masses)
         return variance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None]:
-        weight, centred, images = ctx.saved_tensors
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None, None]:
+        weight, centred, images, masses = ctx.saved_tensors
         weighted = 2 * gradient.unsqueeze(2)
         grad_centred = None
         if ctx.needs_input_grad[1]:
-            grad_centred = centred @ (weight.t() @ (weighted / centred.shape[1] * weight))
-        return (weighted * images).sum(dim=0), grad_centred
+            grad_centred = centred @ (weight.t() @ (weighted / total_mass(centred, masses) * weight))
+            grad_centred = grad_centred if masses is None else grad_centred.mul_(masses)
+        return (weighted * images).sum(dim=0), grad_centred, None
 
 
 def _search_precision(features: Tensor) -> torch.dtype:

@@ -3,6 +3,8 @@
 Vertices are thinned to one in each cell of a grid, and weighted by the inverse of their density. Both need vertices
 alone, so that a point cloud, a mesh with holes and one whose faces point inwards are all the same; where it is known
 what is near along the surface, what merely touches does not count as near.
+
+Where statistics are taken over all vertices, each has a mass by its density in the same way (`vertex_masses`).
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
+from training.networks.layers.modulation import full_precision
 from training.networks.layers.surface import Surface, of_cells
 
 _CELL = 1 / 16
@@ -21,6 +25,8 @@ _MOST = 1024
 _MOST_AT_ONCE = 1024
 _RADIUS = 0.1
 """Of the Gaussian that counts neighbours: about that of an arm."""
+_NODES = 12
+"""Of the grid on which all vertices are counted, in half the longest edge of a mesh' box."""
 
 
 class Sample(NamedTuple):
@@ -45,6 +51,37 @@ class Sample(NamedTuple):
     masses: Tensor
     near: Tensor
     surface: Surface | None
+
+
+def masses_by(norm_weights: str, vertices: Tensor) -> Tensor | None:
+    """Return `vertex_masses` for ``"area"``, None for ``"uniform"``: what a network's norms take."""
+    return vertex_masses(vertices) if norm_weights == "area" else None
+
+
+@torch.no_grad()
+def vertex_masses(vertices: Tensor) -> Tensor:
+    """Return the masses [b, n, 1] of vertices [b, n, 3] in the normalised box, about the area around each; in sum one.
+
+    They are the inverse of how many vertices lie near, by a Gaussian: those of a part that is meshed twice as finely
+    are half as large. Vertices are counted at the nearest nodes of a grid, the counts blurred there and read between
+    the nodes, so that time and memory are linear in the vertices. Counts are whole numbers, the same in any order.
+    """
+    meshes, count, _ = vertices.shape
+    edge = 2 * _NODES + 1
+    placed = vertices.nan_to_num().clamp(-1, 1)
+    x, y, z = ((placed + 1) * _NODES).round().long().unbind(2)
+    number = ((z * edge + y) * edge + x) * meshes + torch.arange(meshes, device=vertices.device)[:, None]
+    ones = vertices.new_ones(1).expand(meshes * count)
+    density = vertices.new_zeros(edge**3 * meshes).scatter_add(0, number.flatten(), ones)
+    nodes = torch.arange(edge, device=vertices.device, dtype=vertices.dtype) / (_NODES * _RADIUS)
+    blur = torch.exp(-0.5 * (nodes[:, None] - nodes).square())
+    with full_precision(vertices):
+        for _ in range(3):  # along the first axis, which then becomes the last: [z, y, x, b] to [b, z, y, x]
+            density = (blur @ density.view(edge, -1)).mT.contiguous()
+        grid = density.view(meshes, 1, edge, edge, edge)
+        near = grid_sample(grid, placed[:, :, None, None], align_corners=True)[:, 0, :, 0]
+    broken = vertices.sum((1, 2), keepdim=True) * 0  # not a number where one is
+    return 1 / near / (1 / near).sum(dim=1, keepdim=True) + broken
 
 
 def sample(vertices: Tensor, surface: Surface | None = None) -> Sample:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv1d, instance_norm, linear
+from torch.nn.functional import conv1d, linear
 
 from tests.literal.corenet3d import LiteralElaIN
 from tests.literal.dsffnet import LiteralNorm
+from tests.literal.norms import InstanceNorm
 from tests.support.three_networks import lively, meshes
 from training.networks.dsffnet import DSFFNet, joined
 from training.networks.layers import modulation
@@ -39,9 +40,11 @@ def _mesh(vertices: int, seed: int = 1) -> Tensor:
     return meshes(vertices, seed=seed, dtype=torch.float64)
 
 
-def _by_channel(features: Tensor) -> Tensor:
+def _by_channel(features: Tensor, masses: Tensor | None = None) -> Tensor:
     """Instance norm of ``[b, n, c]``."""
-    return instance_norm(features.transpose(1, 2)).transpose(1, 2)
+    norm = InstanceNorm()
+    norm.masses = None if masses is None else masses.mT
+    return norm(features.mT).mT
 
 
 def test_a_linear_layer_of_pose_and_vertex_is_one_affine_map_a_mesh() -> None:
@@ -124,15 +127,18 @@ def test_3d_corenets_wide_convolution_and_the_next_layer_are_one_map_of_nine_num
     torch.testing.assert_close(found.deviation, (expected.var(dim=1, keepdim=True) + 1e-5).sqrt(), **EXACT)
 
 
-@pytest.mark.parametrize("normalised", [True, False])
-def test_modulated_relu_has_the_derivative_of_its_equation(normalised: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("normalised", "weighted"), [(True, False), (False, False), (True, True)])
+def test_modulated_relu_has_the_derivative_of_its_equation(
+    normalised: bool, weighted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(modulation, "CHUNK_ELEMENTS", 30)
     inputs = [torch.randn(shape, requires_grad=True) for shape in ((2, 9, 5), (2, 9, 4), (2, 4, 5), (2, 4, 5))]
     hidden, vertices, scale, shift = inputs
-    assert torch.autograd.gradcheck(lambda *given: modulated_relu(*given, normalised=normalised), inputs)
-    normal = _by_channel(hidden) if normalised else hidden
+    options = {"normalised": normalised, "masses": torch.randn(2, 9, 1).softmax(dim=1) if weighted else None}
+    assert torch.autograd.gradcheck(lambda *given: modulated_relu(*given, **options), inputs)
+    normal = _by_channel(hidden, options["masses"]) if normalised else hidden
     expected = torch.relu(normal * (vertices @ scale) + vertices @ shift)
-    torch.testing.assert_close(modulated_relu(*inputs, normalised=normalised), expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(modulated_relu(*inputs, **options), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_deviation_after_has_the_derivative_of_its_equation() -> None:
@@ -141,6 +147,10 @@ def test_deviation_after_has_the_derivative_of_its_equation() -> None:
     assert torch.autograd.gradcheck(deviation_after, (weight, features))
     variance = (features @ weight.t()).var(dim=1, correction=0)
     torch.testing.assert_close(deviation_after(weight, features), torch.rsqrt(variance + 1e-5))
+    masses = torch.randn(2, 9, 1).softmax(dim=1)
+    assert torch.autograd.gradcheck(lambda *given: deviation_after(*given, masses), (weight, features))
+    variance = ((features @ weight.t()).square() * masses).sum(dim=1)
+    torch.testing.assert_close(deviation_after(weight, features, masses), torch.rsqrt(variance + 1e-5))
 
 
 def test_a_mean_far_above_the_deviation_does_not_spoil_the_norm() -> None:
