@@ -64,7 +64,7 @@ def anny(topology: AnnyTopology, identities: int, poses: int) -> Iterator[NDArra
 
 def read_animal(path: Path) -> NDArray[np.floating]:
     """Vertices of an animal at rest; the stag's without its horns, which are a mesh of their own."""
-    return read_mesh_file(path, geometry="Stag" if path.stem == "stag" else None).mesh.vertices
+    return read_mesh_file(path, geometries=["Stag"] if path.stem == "stag" else []).mesh.vertices
 
 
 def report(transfer: PoseTransfer, name: str, meshes: list[NDArray[np.floating]]) -> None:

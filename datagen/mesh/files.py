@@ -6,11 +6,13 @@ is kept, and the rest is named. Each format has a reader of its own: a general l
 OBJ file at its seams, and take longer to import than this command has time.
 
 Limits: files of up to 2,000,000 vertices and 1 GiB; polygons with more than three corners count as fans of triangles;
-all objects of an OBJ file are one mesh, as they share its vertices; glTF with compressed geometry is refused.
+all geometries of a GLB file and all objects of an OBJ file are one mesh, unless some are chosen; glTF with compressed
+geometry is refused.
 """
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +41,8 @@ class MeshFile:
         Where it is.
     name
         The object's name in the file, else the file's stem.
+    geometries
+        Names of those that the mesh is made of, as a GLB has them; none in formats that have no such names.
     mesh
         ``vertices`` [n, 3] float64 as they lie in the file, in its own unit and axes (GLB: in world space);
         ``faces`` [f, 3] int64, polygons as fans of triangles.
@@ -49,19 +53,23 @@ class MeshFile:
     mesh: Mesh
     content: Content = field(repr=False)
 
+    @property
+    def geometries(self) -> tuple[str, ...]:
+        return self.content.geometries
 
-def read_mesh_file(path: str | Path, *, geometry: str | None = None) -> MeshFile:
+
+def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = ()) -> MeshFile:
     """Read a mesh file (OBJ, PLY, GLB, OFF or STL) with all that is needed to write it again.
 
-    ``geometry`` names the one to take of a GLB scene that holds several; other formats are one mesh as a whole.
+    ``geometries`` names those to take of a GLB scene, or groups and objects of an OBJ; by default all are one mesh.
 
     Raises
     ------
     MeshError
         One line for whatever is wrong: no such file, unknown format, damage, no faces, numbers that are not finite,
-        faces without vertices, no extent, no thickness, too many vertices, several geometries.
+        faces without vertices, no extent, no thickness, too many vertices, geometries that are not one body.
     """
-    read = _read(Path(path), geometry)
+    read = _read(Path(path), geometries)
     require_thickness(read.content.vertices, read.path)
     return read
 
@@ -74,14 +82,14 @@ def load_mesh(path: str | Path) -> Mesh:
     MeshError
         The file is missing, of an unknown format, unreadable, or not one usable mesh.
     """
-    return _read(Path(path), None).mesh
+    return _read(Path(path), ()).mesh
 
 
-def _read(path: Path, geometry: str | None) -> MeshFile:
+def _read(path: Path, geometries: Sequence[str]) -> MeshFile:
     require_file(path)
     try:
         refuse_huge(path)
-        content = format_of(path.suffix.lower()).read(path, geometry)
+        content = format_of(path.suffix.lower()).read(path, geometries)
         vertices, faces = content.vertices, _faces(content, path)
     except MeshError:
         raise

@@ -125,7 +125,8 @@ def remarks(
         line = "" if fits else _about_standing(name, axes, way, None if stated else both)
     if not fits:
         yield line
-    yield from _about_parts(name, mesh)
+    if not (fits and isinstance(axes, Standing)):  # what is understood may be of many parts: clothes, hair, eyes
+        yield from _about_parts(name, mesh)
     yield from _about_box(name, upright, seen if fits else None)
     if not isinstance(axes, Standing):  # a network that reads a sample of the surface does not mind
         yield from _about_count(name, len(upright), seen)
@@ -163,7 +164,7 @@ def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
     if sizes[0] < _MAIN_SHARE * sizes.sum():
         yield (
             f"{name} has {len(sizes)} separate parts, the largest with {sizes[0] / sizes.sum():.0%} of the vertices: "
-            "one body is posed as a whole; save one body without props as a file of its own"
+            "one body is posed as a whole; choose it by --source-geometry or --target-geometry, or save it by itself"
         )
 
 

@@ -30,8 +30,14 @@ def _transfer_options(made: Parser) -> None:
     )
     made.add_argument("--target", metavar="B", help="mesh of the wanted identity")
     made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
-    made.add_argument("--source-geometry", metavar="NAME", help="which of several geometries of a GLB has the pose")
-    made.add_argument("--target-geometry", metavar="NAME", help="which of several geometries of a GLB is posed")
+    for whose in ("source", "target"):
+        made.add_argument(
+            f"--{whose}-geometry",
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"geometries (GLB), groups or objects (OBJ) of the {whose} to take, one each time (all)",
+        )
     made.add_argument("--force", action="store_true", help="without --model: pose even a person like an animal")
     _add_standing(made)
     _add_extras(made)
@@ -66,12 +72,17 @@ def transfer_command(options: argparse.Namespace) -> None:
       dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
       dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine
     """
+    from datagen.mesh.geometries import listed
     from workflows.transfer.job import TransferJob
 
     job = TransferJob.from_options(options)
     job.check_places()
     source, target = job.read_source(0), job.read_target()
     job.check_textures(source, target)
+    for mesh, option in ((source, "--source-geometry"), (target, "--target-geometry")):
+        if len(mesh.geometries) > 1:
+            taken = f"{mesh.path}: {listed(mesh.geometries)} as one body ({option} chooses among them)"
+            print_text(printable(taken))
     with (
         weights_of(options) as weights,
         memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"),

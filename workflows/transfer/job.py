@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,8 +35,8 @@ class TransferJob:
     project: Path | None = None
     picture: bool = False
     viewer: bool = False
-    source_geometry: str | None = None
-    target_geometry: str | None = None
+    source_geometry: Sequence[str] = ()
+    target_geometry: Sequence[str] = ()
 
     @classmethod
     def from_options(cls, options: argparse.Namespace) -> "TransferJob":
@@ -102,11 +102,11 @@ class TransferJob:
 
     def read_source(self, number: int) -> MeshFile:
         """The source, or a frame of the sequence."""
-        return read_mesh_file(self.sources[number], geometry=self.source_geometry)
+        return read_mesh_file(self.sources[number], geometries=self.source_geometry)
 
     def read_target(self) -> MeshFile:
         """The target with all that is needed to write it again."""
-        return read_mesh_file(self.target, geometry=self.target_geometry)
+        return read_mesh_file(self.target, geometries=self.target_geometry)
 
     def check_places(self) -> None:
         """Refuse, before any work, what could not be written at its end, or would write over what is read.

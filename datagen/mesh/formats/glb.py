@@ -1,12 +1,13 @@
-"""GLB files as a person has them: one mesh of the scene, in world space, with the file's own materials and textures.
+"""GLB files as a person has them: meshes of the scene, in world space, with the file's own materials and textures.
 
 What is posed is what a viewer shows at rest: node transforms, the skin in its rest pose and the morph targets' default
-weights are applied. Written again, the mesh has no skin and no morph targets, and the file no animations; the tree of
-nodes and their names, materials, textures and texture coordinates are kept. Tangents are left to the viewer to derive
-again, as the glTF specification has it (3.7.2.1).
+weights are applied. Several geometries (body, hair, hat) are one mesh. Written again, each has a mesh of its own below
+its node, no skin and no morph targets, and the file no animations; the tree of nodes and their names, materials,
+textures and texture coordinates are kept. Tangents are left to the viewer to derive again, as the glTF specification
+has it (3.7.2.1).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,33 +20,33 @@ from datagen.mesh.formats.glb_export import built_glb
 from datagen.mesh.formats.glb_writer import Block, Draft, GlbParts, Json
 from datagen.mesh.formats.gltf import SOLID, Gltf, triangles
 from datagen.mesh.formats.gltf_materials import base_texture, image_bytes, read_material
-from datagen.mesh.formats.surface import Alone, Encoded, Format, Image, Surface, numbered, srgb
+from datagen.mesh.formats.surface import Alone, Encoded, Format, Image, Surface, numbered, srgb, unit
+from datagen.mesh.geometries import require_known_names, require_one_body
 from datagen.mesh.limits import require_counts
 
 
-def read_glb(path: Path, geometry: str | None) -> "GlbContent":
-    """Read one mesh of a scene: the one called ``geometry``, or the only one.
+def read_glb(path: Path, geometries: Sequence[str]) -> "GlbContent":
+    """Read geometries of a scene as one mesh: those of these names, or all that it shows.
 
     Raises
     ------
     MeshError
-        There are no faces, no such geometry, or several to choose from.
+        There are no faces, no such geometry, or several that do not make one body.
     """
     with path.open("rb") as beginning:
         if beginning.read(4) != b"glTF":
             raise ValueError("it does not begin with 'glTF' (a text, or a .gltf by another name?)")
     scene = Gltf(path)
     nodes = solid_nodes(scene)
-    names = ", ".join(map(repr, nodes))
     if not nodes:
         raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); pose transfer needs a mesh")
-    if geometry is not None and geometry not in nodes:
-        raise MeshError(f"{path} has no geometry {geometry!r}; it has {names}")
-    if geometry is None and len(nodes) > 1:
-        how = "--source-geometry NAME or --target-geometry NAME"
-        raise MeshError(f"{path} holds {len(nodes)} geometries: {names}. Choose one with {how}")
-    name = geometry or next(iter(nodes))
-    return GlbContent(scene, name, nodes[name])
+    require_known_names(geometries, nodes, path, what="geometry")
+    shown = {name: node for name, node in nodes.items() if node in scene.shown and not _is_nothing(scene, node)}
+    taken = {name: node for name, node in nodes.items() if name in geometries} or shown or nodes
+    content = GlbContent(scene, taken)
+    if not geometries:
+        require_one_body(content.extents, path)
+    return content
 
 
 def solid_nodes(file: Gltf) -> dict[str, int]:
@@ -60,61 +61,95 @@ def solid_nodes(file: Gltf) -> dict[str, int]:
     return found
 
 
+def _is_nothing(file: Gltf, node: int) -> bool:
+    """Whether a node is scaled to nothing, by which some programs hide what is there."""
+    return bool(abs(np.linalg.det(file.world[node][:3, :3])) < 1e-30)
+
+
 _KEPT_ON_PRIMITIVES = ("KHR_materials_variants",)
 _DERIVED = ("POSITION", "NORMAL", "TANGENT", "JOINTS_", "WEIGHTS_")
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A primitive of triangles: its place in the list of primitives, and where its vertices begin in the mesh."""
+    """A primitive of triangles: its node and JSON, where its vertices begin in the mesh, its corners from there."""
 
-    number: int
+    node: int
     json: Json
     start: int
     corners: NDArray[np.int64]
 
+    @property
+    def accessor(self) -> tuple[int, int]:
+        """Its node and accessor of positions, which primitives of a mesh may share; nodes with one mesh do not."""
+        return self.node, self.json["attributes"]["POSITION"]
+
 
 class GlbContent(Alone):
-    """One mesh of a GLB file; textures that lie beside it are written into the new one."""
+    """Geometries of a GLB file as one mesh; textures that lie beside it are written into the new one."""
 
-    def __init__(self, file: Gltf, name: str, node: int) -> None:
-        self.name: str | None = name
-        self._file, self._node_number, self._node = file, node, file.nodes[node]
-        self._mesh = file.json["meshes"][self._node["mesh"]]
-        self._world = file.world[node]
-        if abs(np.linalg.det(self._world[:3, :3])) < 1e-30:
-            raise ValueError(f"node {name!r} is scaled to nothing: apply its scale and export it again")
-        self._starts = self._accessor_starts()
+    def __init__(self, file: Gltf, nodes: Mapping[str, int]) -> None:
+        self.geometries = tuple(nodes)
+        self.name: str | None = self.geometries[0] if len(nodes) == 1 else None
+        self._file, self._nodes = file, list(nodes.values())
+        for name, node in nodes.items():
+            if _is_nothing(file, node):
+                raise ValueError(f"node {name!r} is scaled to nothing: apply its scale and export it again")
         self._pieces = list(self._read_pieces())
-        self.vertices = np.concatenate([self._positions(piece) for piece in self._firsts])
+        firsts: dict[tuple[int, int], Piece] = {}
+        for piece in self._pieces:
+            firsts.setdefault(piece.accessor, piece)
+        self._firsts = list(firsts.values())
+        positions = [self._positions(piece) for piece in self._firsts]
+        self.vertices = np.concatenate([np.empty((0, 3)), *positions])
         self.draft()  # what cannot be read is to be known now, not when all is computed
 
-    def _accessor_starts(self) -> dict[int, int]:
-        """Where the vertices of each accessor of positions begin in the mesh; primitives may share one."""
-        starts, total = dict[int, int](), 0
-        for primitive in self._mesh["primitives"]:
-            accessor = primitive.get("attributes", {}).get("POSITION")
-            if primitive.get("mode", 4) in SOLID and accessor not in starts and accessor is not None:
-                starts[accessor] = total
-                total += self._file.json["accessors"][accessor]["count"]
-        require_counts(vertices=total)
-        return starts
+    @property
+    def extents(self) -> dict[str, NDArray[np.float64]]:
+        """Least and greatest coordinates [2, 3] of each geometry that has vertices."""
+        found: dict[str, NDArray[np.float64]] = {}
+        for name, node in zip(self.geometries, self._nodes, strict=True):
+            own = [self.vertices[self._rows(piece)] for piece in self._firsts if piece.node == node]
+            if own:
+                both = np.concatenate(own)
+                found[name] = np.stack([both.min(axis=0), both.max(axis=0)])
+        return found
+
+    def _rows(self, piece: Piece) -> slice:
+        return slice(piece.start, piece.start + self._file.json["accessors"][piece.accessor[1]]["count"])
 
     def _read_pieces(self) -> Iterator[Piece]:
-        total = 0
-        for number, primitive in enumerate(self._mesh["primitives"]):
-            mode, accessor = primitive.get("mode", 4), primitive.get("attributes", {}).get("POSITION")
-            if mode in SOLID and accessor is not None:
+        starts, vertices, corners = dict[tuple[int, int], int](), 0, 0
+        for node in self._nodes:
+            is_mirrored = "skin" not in self._file.nodes[node] and np.linalg.det(self._file.world[node][:3, :3]) < 0
+            for primitive in self._primitives(node):
+                mode, accessor = primitive.get("mode", 4), primitive.get("attributes", {}).get("POSITION")
+                if mode not in SOLID or accessor is None:
+                    continue
                 size = self._file.json["accessors"][accessor]["count"]
-                corners = np.arange(size)
-                if "indices" in primitive:
-                    corners = self._file.accessor(primitive["indices"]).ravel().astype(np.int64)
-                if corners.size and corners.max() >= size:
-                    raise ValueError(f"a face names vertex {corners.max()}, but there are {size} (from 0)")
-                total += len(corners)
-                require_counts(corners=total)
+                if (node, accessor) not in starts:
+                    starts[node, accessor], vertices = vertices, vertices + size
+                    require_counts(vertices=vertices)
                 self._require_alike(primitive["attributes"], size)
-                yield Piece(number, primitive, self._starts[accessor], triangles(corners, mode).ravel())
+                found = self._corners(primitive, size)
+                corners += len(found)
+                require_counts(corners=corners)
+                faces = triangles(found, mode)
+                turned = faces[:, ::-1] if is_mirrored else faces  # 3.7.4: a mirror turns what is in front
+                yield Piece(node, primitive, starts[node, accessor], turned.ravel())
+
+    def _primitives(self, node: int) -> list[Json]:
+        found: list[Json] = self._file.json["meshes"][self._file.nodes[node]["mesh"]]["primitives"]
+        return found
+
+    def _corners(self, primitive: Json, size: int) -> NDArray[np.int64]:
+        """Vertices of the accessor at the corners [corner] of a primitive, in its own order."""
+        if "indices" not in primitive:
+            return np.arange(size)
+        corners = self._file.accessor(primitive["indices"]).ravel().astype(np.int64)
+        if corners.size and corners.max() >= size:
+            raise ValueError(f"a face names vertex {corners.max()}, but there are {size} (from 0)")
+        return corners
 
     def _require_alike(self, attributes: Json, size: int) -> None:
         """Refuse attributes of another count than the positions (3.7.2.1): they would be copied as they are."""
@@ -123,26 +158,20 @@ class GlbContent(Alone):
             if there != size:
                 raise ValueError(f"{name} has {there} elements for {size} vertices")
 
-    @property
-    def _firsts(self) -> list[Piece]:
-        """The first piece of each accessor of positions."""
-        return list({piece.start: piece for piece in reversed(self._pieces)}[start] for start in self._starts.values())
-
     def _positions(self, piece: Piece) -> NDArray[np.float64]:
         """World positions [vertex, 3] of the accessor that a piece uses."""
-        attributes = piece.json["attributes"]
+        attributes, node = piece.json["attributes"], self._file.nodes[piece.node]
         local = self._file.accessor(attributes["POSITION"]).astype(np.float64)
-        weights = self._node.get("weights", self._mesh.get("weights", ()))
+        weights = node.get("weights", self._file.json["meshes"][node["mesh"]].get("weights", ()))
         for weight, target in zip(weights, piece.json.get("targets", ()), strict=False):
             if weight and "POSITION" in target:
                 local = local + weight * self._file.accessor(target["POSITION"])
-        if "skin" not in self._node or "JOINTS_0" not in attributes:
-            return _moved(local, self._world)
-        return self._skinned(local, attributes)
+        if "skin" not in node or "JOINTS_0" not in attributes:
+            return _moved(local, self._file.world[piece.node])
+        return self._skinned(local, attributes, self._file.json["skins"][node["skin"]])
 
-    def _skinned(self, local: NDArray[np.float64], attributes: Json) -> NDArray[np.float64]:
+    def _skinned(self, local: NDArray[np.float64], attributes: Json, skin: Json) -> NDArray[np.float64]:
         """Positions as the skin shows them at rest; the node's own transform does not matter then (3.7.3.3)."""
-        skin = self._file.json["skins"][self._node["skin"]]
         joints = self._file.world[skin["joints"]] @ self._file.inverse_bind(skin)
         numbers, weights = self._file.influences(attributes)
         weights = weights / np.maximum(weights.astype(np.float64).sum(axis=1, keepdims=True), 1e-12)
@@ -173,10 +202,19 @@ class GlbContent(Alone):
     @cached_property
     def _group(self) -> NDArray[np.int64] | None:
         """Vertices [vertex] that share a normal: those at one place with one normal, as along a seam."""
-        if not all("NORMAL" in piece.json["attributes"] for piece in self._pieces):
+        if not any("NORMAL" in piece.json["attributes"] for piece in self._pieces):
             return None
-        normals = [self._file.accessor(piece.json["attributes"]["NORMAL"]) for piece in self._firsts]
-        return numbered(np.concatenate([self.vertices, np.concatenate(normals).astype(np.float64)], axis=1))
+        normals = [self._normals(piece) for piece in self._firsts]
+        return numbered(np.concatenate([self.vertices, np.concatenate(normals)], axis=1))
+
+    def _normals(self, piece: Piece) -> NDArray[np.float64]:
+        """The file's normals [vertex, 3] in world space, but for the skin; zeros where there are none."""
+        if "NORMAL" not in piece.json["attributes"]:
+            return np.zeros((self._file.json["accessors"][piece.accessor[1]]["count"], 3))
+        local = self._file.accessor(piece.json["attributes"]["NORMAL"]).astype(np.float64)
+        if "skin" in self._file.nodes[piece.node]:
+            return local
+        return unit(local @ np.linalg.inv(self._file.world[piece.node][:3, :3]))
 
     def _uvs(self) -> NDArray[np.float64] | None:
         """Texture coordinates [corner, 2] with their origin moved from the upper to the lower left."""
@@ -191,11 +229,18 @@ class GlbContent(Alone):
         return np.concatenate(found) * (1, -1) + (0, 1)
 
     def _colours(self) -> NDArray[np.uint8] | None:
-        if not all("COLOR_0" in piece.json["attributes"] for piece in self._pieces):
+        """Colours [vertex, 4] of those pieces that have any; the others are white, which changes nothing (3.9.2)."""
+        if not any("COLOR_0" in piece.json["attributes"] for piece in self._pieces):
             return None
-        found = [self._file.accessor(piece.json["attributes"]["COLOR_0"]) for piece in self._firsts]
-        opaque = [np.concatenate([each, np.ones((len(each), 4 - each.shape[1]))], axis=1) for each in found]
-        return srgb(np.concatenate(opaque))
+        return srgb(np.concatenate([self._colours_of(piece) for piece in self._firsts]))
+
+    def _colours_of(self, piece: Piece) -> NDArray[np.float64]:
+        rows = self._rows(piece)
+        found = np.ones((rows.stop - rows.start, 4))
+        if "COLOR_0" in piece.json["attributes"]:
+            colours = self._file.accessor(piece.json["attributes"]["COLOR_0"])
+            found[:, : colours.shape[1]] = colours
+        return found
 
     @property
     def only_here(self) -> list[str]:
@@ -206,17 +251,23 @@ class GlbContent(Alone):
             self._file.json["materials"][n] for n in {p.json.get("material", -1) for p in self._pieces} if n >= 0
         ]
         rich = any(set(m) - known or set(m.get("pbrMetallicRoughness", {})) - plain for m in materials)
-        return [*self._lost, *(["material properties beyond base colour and its texture"] if rich else [])]
+        names = ["names of its geometries"] if len(self.geometries) > 1 else []
+        return [*self._lost, *names, *(["material properties beyond base colour and its texture"] if rich else [])]
 
     @property
     def _lost(self) -> list[str]:
-        others = [name for name, number in solid_nodes(self._file).items() if number != self._node_number]
+        others = {name: node for name, node in solid_nodes(self._file).items() if node not in self._nodes}
         parts = {
             f"other geometries: {', '.join(others)}": others,
             "skins": self._file.json.get("skins"),
             "animations": self._file.json.get("animations"),
             "morph targets": any("targets" in piece.json for piece in self._pieces),
-            "lines and points": len(self._pieces) < len(self._mesh["primitives"]),
+            "lines and points": any(
+                primitive.get("mode", 4) not in SOLID
+                for number, node in enumerate(self._file.nodes)
+                if "mesh" in node and number not in others.values()
+                for primitive in self._primitives(number)
+            ),
         }
         return [name for name, there in parts.items() if there]
 
@@ -225,22 +276,30 @@ class GlbContent(Alone):
         return Encoded(self.draft().static(vertices), {}, self._lost)
 
     def draft(self) -> Draft:
-        """Return the file without this mesh's positions and normals, to be filled in."""
+        """Return the file without positions and normals of the mesh, to be filled in."""
         parts = GlbParts({k: v for k, v in self._file.json.items() if k not in _REBUILT})
         copied: dict[int, int] = {}
         primitives = [self._primitive(piece, parts, copied) for piece in self._pieces]
-        parts.json["meshes"] = [{k: v for k, v in self._mesh.items() if k not in ("weights", "extras")}]
-        parts.json["meshes"][0]["primitives"] = primitives
+        parts.json["meshes"] = [self._own_mesh(node, primitives) for node in self._nodes]
         parts.json["nodes"] = [self._stripped(number, node) for number, node in enumerate(self._file.nodes)]
         if "images" in self._file.json:
             parts.json["images"] = [self._copied_image(image, parts) for image in self._file.json["images"]]
-        blocks = []
-        for piece in self._firsts:
-            sharing = [p for each, p in zip(self._pieces, primitives, strict=True) if each.start == piece.start]
-            size = self._file.json["accessors"][piece.json["attributes"]["POSITION"]]["count"]
-            blocks.append(Block(np.arange(piece.start, piece.start + size), sharing))
-        every = np.arange(len(self.vertices))
-        return Draft(parts, blocks, self.surface, every, self._group, np.linalg.inv(self._world))
+        sharing: dict[tuple[int, int], list[Json]] = {}
+        for piece, primitive in zip(self._pieces, primitives, strict=True):
+            sharing.setdefault(piece.accessor, []).append(primitive)
+        blocks = [self._block(piece, sharing[piece.accessor]) for piece in self._firsts]
+        return Draft(parts, blocks, self.surface, np.arange(len(self.vertices)), self._group)
+
+    def _own_mesh(self, node: int, primitives: list[Json]) -> Json:
+        """The mesh of a node, with its own ones of all primitives: one that several nodes share is posed for each."""
+        mesh = self._file.json["meshes"][self._file.nodes[node]["mesh"]]
+        own = [new for piece, new in zip(self._pieces, primitives, strict=True) if piece.node == node]
+        return {k: v for k, v in mesh.items() if k not in ("weights", "extras")} | {"primitives": own}
+
+    def _block(self, piece: Piece, primitives: list[Json]) -> Block:
+        rows = self._rows(piece)
+        vertices, world = np.arange(rows.start, rows.stop), self._file.world[piece.node]
+        return Block(vertices, primitives, world, has_normals="NORMAL" in piece.json["attributes"])
 
     def _primitive(self, piece: Piece, parts: GlbParts, copied: dict[int, int]) -> Json:
         kept = {k: v for k, v in piece.json.items() if k not in ("attributes", "targets", "extensions", "indices")}
@@ -258,7 +317,7 @@ class GlbContent(Alone):
         return kept
 
     def _stripped(self, number: int, node: Json) -> Json:
-        mesh = {"mesh": 0} if number == self._node_number else {}
+        mesh = {"mesh": self._nodes.index(number)} if number in self._nodes else {}
         kept = {k: v for k, v in node.items() if k not in ("mesh", "skin", "weights", "extensions")}
         extensions = {k: v for k, v in node.get("extensions", {}).items() if k != "EXT_mesh_gpu_instancing"}
         return kept | mesh | ({"extensions": extensions} if extensions else {})

@@ -37,7 +37,7 @@ def built_draft(surface: Surface, count: int, name: str) -> tuple[Draft, list[st
     left_out += ["quads: written as triangles"] if surface.has_polygons else []
     left_out += [f"seams: {len(of) - count:,} vertices are written again after the others"] if len(of) > count else []
     group = np.where(first >= 0, shading[first], shading.max(initial=-1) + 1)
-    return Draft(parts, [Block(np.arange(len(of)), primitives)], shaded, of, group, np.eye(4)), left_out
+    return Draft(parts, [Block(np.arange(len(of)), primitives)], shaded, of, group), left_out
 
 
 def _split(surface: Surface, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -10,6 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError
 from datagen.common.files import atomic_file
-from datagen.mesh.formats.surface import Surface, shared_normals
+from datagen.mesh.formats.surface import Surface, shared_normals, unit
 from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT
 
 Json = dict[str, Any]
@@ -75,10 +76,23 @@ class GlbParts:
 
 @dataclass
 class Block:
-    """Vertices [k] of the draft that primitives share."""
+    """Vertices [k] of the draft that primitives share, below a node of this transform [4, 4] to world space."""
 
     vertices: NDArray[np.int64]
     primitives: list[Json]
+    world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    has_normals: bool = True
+
+    @cached_property
+    def _to_local(self) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.inv(self.world), np.float64)
+
+    def arrays(self, positions: NDArray[np.float64], normals: NDArray[np.float64] | None) -> list[NDArray[np.float32]]:
+        """Positions, and normals where it has any, in the node's space, from those [n, 3] of all in world space."""
+        local = positions[self.vertices] @ self._to_local[:3, :3].T + self._to_local[:3, 3]
+        if normals is None or not self.has_normals:
+            return [local.astype(np.float32)]
+        return [local.astype(np.float32), unit(normals[self.vertices] @ self.world[:3, :3]).astype(np.float32)]
 
 
 @dataclass
@@ -86,7 +100,7 @@ class Draft:
     """A file that lacks only positions and normals; it can be filled once.
 
     ``of`` [written vertex]: the mesh's vertex at each; ``group`` [written vertex]: its group in the surface's shading,
-    or None for a file without normals; ``to_local`` [4, 4]: world -> the node's space.
+    or None for a file without normals.
     """
 
     parts: GlbParts
@@ -94,22 +108,20 @@ class Draft:
     surface: Surface
     of: NDArray[np.int64]
     group: NDArray[np.int64] | None
-    to_local: NDArray[np.float64]
 
     @property
     def frame_bytes(self) -> int:
         """What a frame of an animation takes: positions, and normals where there are any, in four bytes a number."""
-        return 12 * len(self.of) * (1 if self.group is None else 2)
+        return sum(12 * len(block.vertices) * (2 if block.has_normals else 1) for block in self.blocks)
 
     def arrays(self, vertices: NDArray[np.float64]) -> list[list[NDArray[np.float32]]]:
         """Positions, and normals where there are any, of each block, from the mesh's vertices [n, 3] in world space."""
-        local = vertices @ self.to_local[:3, :3].T + self.to_local[:3, 3]
-        found = [local[self.of]]
+        normals = None
         if self.group is not None:
             assert self.surface.shading is not None
             groups = int(self.group.max()) + 1
-            found.append(shared_normals(local, self.surface, self.surface.shading, count=groups)[self.group])
-        return [[each[block.vertices].astype(np.float32) for each in found] for block in self.blocks]
+            normals = shared_normals(vertices, self.surface, self.surface.shading, count=groups)[self.group]
+        return [block.arrays(vertices[self.of], normals) for block in self.blocks]
 
     def static(self, vertices: NDArray[np.float64]) -> bytes:
         """Return the file with these vertices [n, 3]."""
@@ -177,9 +189,9 @@ class Draft:
         self._add_targets(bounds, len(views) - 1)
         for mesh in self.parts.json["meshes"]:
             mesh["weights"] = [0.0] * count
-        node = next(n for n, each in enumerate(self.parts.json["nodes"]) if "mesh" in each)
-        channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
-        self.parts.json["animations"] = [{"name": "poses", "samplers": [sampler], "channels": [channel]}]
+        nodes = [number for number, each in enumerate(self.parts.json["nodes"]) if "mesh" in each]
+        channels = [{"sampler": 0, "target": {"node": node, "path": "weights"}} for node in nodes]
+        self.parts.json["animations"] = [{"name": "poses", "samplers": [sampler], "channels": channels}]
 
     def _add_targets(self, bounds: list[list[list[tuple[list[float], list[float]]]]], view: int) -> None:
         accessors = self.parts.json["accessors"]

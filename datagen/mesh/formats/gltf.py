@@ -120,6 +120,17 @@ class Gltf:
                 world[number] = world[self.parents[number]] @ world[number]
         return world
 
+    @cached_property
+    def shown(self) -> set[int]:
+        """Nodes of the scene that a viewer shows (3.5.1): the file's choice, else the first; all where it has none."""
+        with reading(self.path, "the list of its scenes"):
+            scenes = self.json.get("scenes") or [{"nodes": range(len(self.nodes))}]
+            wanted = set(scenes[self.json.get("scene", 0)].get("nodes", ()))
+        for number in self.order:  # parents before their children
+            if self.parents[number] in wanted:
+                wanted.add(number)
+        return wanted
+
     def accessor(self, number: int) -> NDArray[Any]:
         """Elements [count, width] of an accessor (3.6.2): strided, sparse and normalised ones included."""
         with reading(self.path, f"accessor {number}"):

@@ -8,6 +8,7 @@ line by line only what is not so regular.
 """
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.mesh.formats.surface import Encoded, Format, Surface, numbers, numbers_in, one_mesh, shared_normals
+from datagen.common.files import read_bounded
+from datagen.mesh.formats.surface import Encoded, Format, Surface, numbers, numbers_in, shared_normals
+from datagen.mesh.geometries import require_known_names
+from datagen.mesh.limits import BYTE_LIMIT
 
 if TYPE_CHECKING:
     from datagen.mesh.formats.mtl import LibraryFiles
@@ -26,11 +30,15 @@ _PATTERNS = {
     (0, 2): re.compile(rb"\s*f(?:\s+-?\d+//-?\d+)+\s*"),
     (0, 1, 2): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+/-?\d+)+\s*"),
 }
+_SECTIONS = (b"o", b"g")
 _ELEMENTS = (b"v", b"vt", b"vn", b"f", b"usemtl", b"mtllib", b"o", b"g", b"s", b"l", b"p")
 
 
 class ObjContent:
     """The text of an OBJ file and what its lines mean."""
+
+    geometries: tuple[str, ...] = ()
+    _lost: tuple[str, ...] = ()
 
     def __init__(self, content: bytes, path: Path) -> None:
         if content[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in content[:4096]:
@@ -61,7 +69,61 @@ class ObjContent:
         """Groups, smoothing groups, names of several objects, lines and points."""
         named = {b"g": "groups", b"s": "smoothing groups", b"l": "lines", b"p": "points"}
         objects = ["names of its objects"] if len(self._at[b"o"]) > 1 else []
-        return objects + [name for element, name in named.items() if self._at[element]]
+        return [*self._lost, *objects, *(name for element, name in named.items() if self._at[element])]
+
+    def only(self, wanted: Sequence[str]) -> "ObjContent":
+        """Return the objects and groups of these names, with the vertices of their faces alone.
+
+        Raises
+        ------
+        MeshError
+            The file has none of such a name.
+        """
+        known = [name for element in _SECTIONS for names in self._section_names(element) for name in names]
+        require_known_names(wanted, known, self._path, what="object or group")
+        kept = np.any([self._is_in(element, wanted) for element in _SECTIONS], axis=0)
+        only = ObjContent(self._text_of(kept), self._path)
+        taken = {name for element in _SECTIONS for names in only._section_names(element) for name in names}
+        others = [name for name in dict.fromkeys(known) if name not in taken]
+        only._lost = (f"other objects and groups: {', '.join(others)}",) if others else ()
+        return only
+
+    def _is_in(self, element: bytes, wanted: Sequence[str]) -> NDArray[np.bool_]:
+        """Which faces [face] are in sections of these names."""
+        sections = [not set(names).isdisjoint(wanted) for names in self._section_names(element)]
+        return np.array([*sections, False])[self._section_of_face(element)]
+
+    def _section_names(self, element: bytes) -> list[list[str]]:
+        """Names of each line that begins a section: an object has one, with spaces or not, a group may have several."""
+        return [line.split() if element == b"g" else [line] for line in self._names(element)]
+
+    def _section_of_face(self, element: bytes) -> NDArray[np.int64]:
+        """Number [face] of the line of an element that holds for each face, -1 before the first."""
+        return np.searchsorted(np.array(self._at[element], np.int64), np.array(self._at[b"f"], np.int64)) - 1
+
+    def _text_of(self, kept: NDArray[np.bool_]) -> bytes:
+        """The text with these faces alone: without lines that they do not need, and with numbers that fit."""
+        table, sizes = self._face_corners
+        lines: list[bytes | None] = list(self._lines)
+        columns, corners = [], table[np.repeat(kept, sizes)]
+        for column, element in zip(corners.T, (b"v", b"vt", b"vn"), strict=True):
+            used = np.unique(column[column >= 0])
+            self._drop(lines, element, used)
+            columns.append(np.where(column < 0, 0, np.searchsorted(used, column) + 1))
+        for element in (*_SECTIONS, b"usemtl"):
+            self._drop(lines, element, self._section_of_face(element)[kept])
+        for element in (b"l", b"p", b"f"):
+            self._drop(lines, element, np.flatnonzero(kept if element == b"f" else []))
+        words = iter([_corner_word(*each) for each in np.stack(columns, axis=1).tolist()])
+        for place in np.array(self._at[b"f"])[kept].tolist():
+            count = len(_words(self._lines[place])) - 1
+            lines[place] = b" ".join([b"f", *(next(words) for _ in range(count))]) + self._end
+        return self._break.join(line for line in lines if line is not None)
+
+    def _drop(self, lines: list[bytes | None], element: bytes, kept: NDArray[np.int64]) -> None:
+        """Leave out all lines of an element but those of these numbers."""
+        for place in np.delete(np.array(self._at[element], np.int64), np.unique(kept[kept >= 0])):
+            lines[place] = None
 
     @cached_property
     def _face_corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -90,7 +152,7 @@ class ObjContent:
         names = self._names(b"usemtl")
         known = {material.name: material for material in self._libraries.materials} if names else {}
         used = list(dict.fromkeys(name for name in names if name in known))
-        current = np.searchsorted(np.array(self._at[b"usemtl"], np.int64), np.array(self._at[b"f"], np.int64)) - 1
+        current = self._section_of_face(b"usemtl")
         number_of = np.array([used.index(name) if name in used else -1 for name in names] + [-1], np.int64)
         return Surface(
             corners=table[:, 0],
@@ -142,7 +204,7 @@ class ObjContent:
         if (shading >= 0).any():
             normals = shared_normals(vertices, self.surface, shading)
             (self._replace_normals if in_place else self._renumber_normals)(lines, normals, shading)
-        return Encoded(self._break.join(line for line in lines if line is not None))
+        return Encoded(self._break.join(line for line in lines if line is not None), {}, list(self._lost))
 
     def _position_lines(self, vertices: NDArray[np.float64]) -> list[bytes]:
         written = vertex_lines(vertices).encode().splitlines()
@@ -224,6 +286,13 @@ def _is_numbers(row: list[bytes], needed: int) -> bool:
         return False
 
 
+def _corner_word(vertex: int, uv: int, normal: int) -> bytes:
+    """A corner by its numbers from 1, 0 for none."""
+    if normal:
+        return b"%d/%d/%d" % (vertex, uv, normal) if uv else b"%d//%d" % (vertex, normal)
+    return b"%d/%d" % (vertex, uv) if uv else b"%d" % vertex
+
+
 def _with_normal(corner: bytes, number: int) -> bytes:
     return b"%b/%d" % (corner.rpartition(b"/")[0], number) if number else corner
 
@@ -286,4 +355,10 @@ def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str
     return built_obj(surface, vertices, name, stem)
 
 
-FORMATS = {".obj": Format(one_mesh(ObjContent), _built)}
+def read_obj(path: Path, geometries: Sequence[str]) -> ObjContent:
+    """Read a file as one mesh, or objects and groups of it by name (MeshError where it has none of that name)."""
+    content = ObjContent(read_bounded(path, limit=BYTE_LIMIT), path)
+    return content.only(geometries) if geometries else content
+
+
+FORMATS = {".obj": Format(read_obj, _built)}

@@ -21,6 +21,7 @@ class PlyContent:
     """The bytes of a PLY file and what they mean."""
 
     name: str | None = None
+    geometries: tuple[str, ...] = ()
 
     def __init__(self, content: bytes, path: Path) -> None:
         self._content, self._path, self._header = content, path, read_header(content)

@@ -99,11 +99,14 @@ class Content(Protocol):
     """A file that was read: what every format's reader returns.
 
     ``vertices`` [n, 3] float64 in the file's unit and axes; ``name`` of the object, None where the file gives none;
-    ``only_here``: what the file has that a :class:`Surface` has no place for.
+    ``geometries``: names of those that it is made of, of formats that have any; ``only_here``: what the file has that a
+    :class:`Surface` has no place for.
     """
 
     @property
     def name(self) -> str | None: ...
+    @property
+    def geometries(self) -> tuple[str, ...]: ...
     @property
     def vertices(self) -> NDArray[np.float64]: ...
     @property
@@ -119,7 +122,9 @@ class Content(Protocol):
 
 
 class Alone:
-    """Content that names no files beside it."""
+    """Content that names no files beside it, and is made of nothing that has a name."""
+
+    geometries: tuple[str, ...] = ()
 
     def companions(self) -> Encoded:
         """Nothing."""
@@ -130,21 +135,22 @@ class Alone:
 class Format:
     """How the files of a format are read and built.
 
-    ``read``: path, and the name of one of several geometries or None -> :class:`Content`. ``build``: surface, vertices
+    ``read``: path, and names of the geometries to take, none for all -> :class:`Content`. ``build``: surface, vertices
     [n, 3], the object's name, and the file's stem, None where no files may lie beside it -> :class:`Encoded`.
     """
 
-    read: Callable[[Path, str | None], Content]
+    read: Callable[[Path, Sequence[str]], Content]
     build: Callable[[Surface, NDArray[np.float64], str, str | None], Encoded]
 
 
-def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, str | None], Content]:
+def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, Sequence[str]], Content]:
     """Return ``read`` of a format whose files are one mesh as a whole."""
 
-    def read(path: Path, geometry: str | None) -> Content:
-        if geometry is not None:
+    def read(path: Path, geometries: Sequence[str]) -> Content:
+        if geometries:
             raise MeshError(
-                f"{path} is one mesh as a whole; only a GLB has geometries to choose: save {geometry!r} by itself"
+                f"{path} is one mesh as a whole; only a GLB and an OBJ have geometries to choose: save "
+                f"{geometries[0]!r} by itself"
             )
         return content(read_bounded(path, limit=BYTE_LIMIT), path)
 

@@ -10,8 +10,11 @@ import trimesh
 from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
 from datagen.mesh.formats.gltf import Gltf
+from datagen.mesh.sequences import write_animation
 from tests.support.shapes.mesh_files import FACES, PNG, POINTS, scene, sound
 from tests.support.shapes.rigged_files import Document
+
+MIRRORED = FACES[:, ::-1]  # as the node of the scene does: what is in front would be behind else
 
 
 def saved(document: Document, folder: Path) -> Path:
@@ -25,7 +28,7 @@ def test_vertices_are_those_of_the_world_and_come_back_through_the_nodes(tmp_pat
     moved = read.mesh.vertices * (1, 2, 3) + 1
     assert write_posed(read, moved, tmp_path / "out.glb") == []
     again = read_mesh_file(tmp_path / "out.glb")
-    assert np.allclose(again.mesh.vertices, moved, atol=1e-5) and np.array_equal(again.mesh.faces, FACES)
+    assert np.allclose(again.mesh.vertices, moved, atol=1e-5) and np.array_equal(again.mesh.faces, MIRRORED)
     loaded = trimesh.load(tmp_path / "out.glb", process=False, force="mesh")
     assert np.allclose(np.sort(loaded.triangles.ravel()), np.sort(moved[FACES].ravel()), atol=1e-5)
 
@@ -102,18 +105,103 @@ def test_skin_animation_and_morphs_are_applied_at_rest_then_dropped_and_named(tm
     assert [node["name"] for node in after["nodes"]] == ["root", "body", "a", "b"]
 
 
-def test_a_scene_of_several_geometries_is_refused_until_one_is_chosen(tmp_path: Path) -> None:
-    both = trimesh.Scene({"body": trimesh.creation.icosphere(1), "hat": trimesh.creation.box()})
-    both.export(tmp_path / "both.glb")
-    with pytest.raises(MeshError, match=r"holds 2 geometries: 'body', 'hat'. Choose one with --source-geometry"):
-        read_mesh_file(tmp_path / "both.glb")
-    with pytest.raises(MeshError, match="no geometry 'shoe'; it has 'body', 'hat'"):
-        read_mesh_file(tmp_path / "both.glb", geometry="shoe")
-    read = read_mesh_file(tmp_path / "both.glb", geometry="hat")
-    assert len(read.mesh.faces) == 12
-    assert write_posed(read, read.mesh.vertices, tmp_path / "hat.glb") == ["other geometries: body"]
-    assert read_mesh_file(tmp_path / "hat.glb").name == "hat"
-    assert len(sound(tmp_path / "hat.glb")["meshes"]) == 1
+def character(folder: Path) -> Path:
+    """A body, two eyes that share a mesh, one of them mirrored and turned, and a coloured hat without normals."""
+    document = scene()
+    ball, box = trimesh.creation.icosphere(2), trimesh.creation.box()
+    eye = {"attributes": {"POSITION": document.accessor(ball.vertices), "NORMAL": document.accessor(ball.vertices)}}
+    hat = {"POSITION": document.accessor(box.vertices), "COLOR_0": document.accessor(np.full((8, 3), 0.25))}
+    document.json["meshes"] += [
+        {"name": "eye", "primitives": [eye | {"indices": document.accessor(ball.faces.ravel(), "uint16")}]},
+        {"name": "hat", "primitives": [{"attributes": hat, "indices": document.accessor(box.faces.ravel(), "uint16")}]},
+    ]
+    document.json["nodes"][0]["children"] += [2, 3, 4]
+    document.json["nodes"] += [
+        {"name": "left", "mesh": 1, "translation": [1, 2, 0]},
+        {"name": "right", "mesh": 1, "translation": [-1, 2, 0], "scale": [-1, 1, 1], "rotation": [0.5, 0.5, 0.5, 0.5]},
+        {"name": "hat", "mesh": 2, "translation": [0, 3, 0], "scale": [1, 2, 1]},
+        {"name": "elsewhere", "mesh": 2},
+        {"name": "hidden", "mesh": 2, "scale": [0, 0, 0]},
+    ]
+    return saved(document, folder)
+
+
+def outward(triangles: Any, middle: Any) -> bool:
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return bool((np.einsum("fi,fi->f", normals, triangles.mean(axis=1) - middle) > 0).all())
+
+
+def test_geometries_that_make_one_body_are_one_mesh_and_come_back_whole(tmp_path: Path) -> None:
+    path = character(tmp_path)
+    read = read_mesh_file(path)
+    assert read.geometries == ("body", "left", "right", "hat") and read.name == "scene"
+    shown = trimesh.load(path, process=False, force="mesh")  # another reader's idea of the same scene
+    assert np.allclose(*(np.unique(each.round(4), axis=0) for each in (read.mesh.vertices, shown.vertices)))
+    moved = read.mesh.vertices * (1, 2, 3) + 1
+    assert write_posed(read, moved, tmp_path / "out.glb") == ["other geometries: elsewhere, hidden"]
+    after, before = sound(tmp_path / "out.glb"), Gltf(path).json
+    assert [node | {"mesh": 0} for node in after["nodes"][:5]] == [node | {"mesh": 0} for node in before["nodes"][:5]]
+    assert [mesh.get("name") for mesh in after["meshes"]] == [None, "eye", "eye", "hat"]
+    assert after["materials"] == before["materials"] and PNG in (tmp_path / "out.glb").read_bytes()
+    again = read_mesh_file(tmp_path / "out.glb")
+    assert again.geometries == read.geometries and np.array_equal(again.mesh.faces, read.mesh.faces)
+    assert np.allclose(again.mesh.vertices, moved, atol=1e-5)
+    for kept in ("uvs", "colours", "material_of"):
+        assert np.array_equal(getattr(again.content.surface, kept), getattr(read.content.surface, kept))
+
+
+def test_mirrored_geometries_point_outwards_as_do_their_normals(tmp_path: Path) -> None:
+    read = read_mesh_file(character(tmp_path), geometries=["left", "right"])
+    assert read.geometries == ("left", "right") and len(read.mesh.vertices) == 2 * 162
+    stretched = read.mesh.vertices * (1, 1, 3)
+    for half in (slice(0, 320), slice(320, 640)):
+        triangles = stretched[read.mesh.faces[half]]
+        assert outward(triangles, triangles.mean(axis=(0, 1)))
+    write_posed(read, stretched, tmp_path / "out.glb")
+    file = Gltf(tmp_path / "out.glb")
+    for node, mesh in zip((2, 3), file.json["meshes"], strict=True):
+        attributes, world = mesh["primitives"][0]["attributes"], file.world[node][:3, :3]
+        positions = file.accessor(attributes["POSITION"]) @ world.T
+        normals = file.accessor(attributes["NORMAL"]) @ np.linalg.inv(world)
+        expected = (positions - positions.mean(axis=0)) / (1, 1, 9)
+        assert (np.einsum("vi,vi->v", normals, expected) > 0.98 * np.linalg.norm(expected, axis=1)).all()
+
+
+def test_every_geometry_moves_in_an_animation(tmp_path: Path) -> None:
+    read = read_mesh_file(character(tmp_path))
+    frames = [read.mesh.vertices + step for step in (0, 1, 2)]
+    write_animation(read, frames, tmp_path / "moving.glb", frames_per_second=10)
+    after = sound(tmp_path / "moving.glb")
+    assert [channel["target"]["node"] for channel in after["animations"][0]["channels"]] == [1, 2, 3, 4]
+    assert all(len(primitive["targets"]) == 2 for mesh in after["meshes"] for primitive in mesh["primitives"])
+    file = Gltf(tmp_path / "moving.glb")
+    last = file.json["meshes"][2]["primitives"][0]["targets"][1]["POSITION"]
+    assert np.allclose(file.accessor(last) @ file.world[3][:3, :3].T, 2, atol=1e-5)
+
+
+def two(folder: Path, at: tuple[float, float, float], other: Any) -> Path:
+    both = trimesh.Scene({"body": trimesh.creation.icosphere(1)})
+    both.add_geometry(
+        other, geom_name="other", node_name="other", transform=trimesh.transformations.translation_matrix(at)
+    )
+    both.export(folder / "both.glb")
+    return folder / "both.glb"
+
+
+def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_path: Path) -> None:
+    path = two(tmp_path, (3, 0, 0), trimesh.creation.box())
+    with pytest.raises(MeshError, match=r"'body', 'other', which .* \(apart: 'other'\). Choose with --source-geom"):
+        read_mesh_file(path)
+    with pytest.raises(MeshError, match="no geometry 'shoe'; it has 'body', 'other'"):
+        read_mesh_file(path, geometries=["body", "shoe"])
+    read = read_mesh_file(path, geometries=["other"])
+    assert len(read.mesh.faces) == 12 and read.name == "other"
+    assert write_posed(read, read.mesh.vertices, tmp_path / "box.glb") == ["other geometries: body"]
+    assert read_mesh_file(tmp_path / "box.glb").name == "other"
+    assert read_mesh_file(path, geometries=["other", "body"]).geometries == ("body", "other")  # in the file's order
+    assert read_mesh_file(two(tmp_path, (1.6, 0, 0), trimesh.creation.box())).geometries == ("body", "other")
+    with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
+        read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box((9, 0, 9))))
 
 
 @pytest.mark.parametrize(

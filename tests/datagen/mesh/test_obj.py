@@ -8,6 +8,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
 from datagen.mesh.formats.obj import ObjContent, face_lines, vertex_lines
 from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
@@ -143,3 +144,62 @@ def test_a_triangle_in_other_words_is_the_same_triangle(text: str) -> None:
 def test_lines_of_other_lengths_are_not_taken_for_regular_ones(rows: str) -> None:
     with pytest.raises(ValueError, match="line 1 is not 3 numbers: 'v 0 0'"):
         ObjContent((rows + PLAIN).encode(), Path("a.obj"))
+
+
+TWO = b"""mtllib look.mtl
+o body
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 0.25 0.75
+vn 0 0 1
+g torso all
+usemtl skin
+f 1/1/1 3/2/1 2/3/1
+f 1 2 4
+g legs all
+f -4//-1 -1//-1 -2//-1
+f 2 3 4
+l 1 2
+o tall hat
+v 0 2 0
+v 1 2 0
+v 0 3 0
+v 0 2 1
+usemtl cloth
+g brim
+f 5 7 6
+f -4/-1 -3/-2 -1/-3
+f 5 8 7
+f 6 7 8
+"""
+
+
+@pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
+def test_groups_and_objects_are_chosen_with_what_they_need(tmp_path: Path, line_end: bytes) -> None:
+    path = golden("cube.obj", tmp_path).with_name("two.obj")
+    path.write_bytes(TWO.replace(b"\n", line_end))
+    whole = read_mesh_file(path)
+    for wanted, faces, rows in (
+        (["tall hat"], slice(4, 8), range(4, 8)),
+        (["brim"], slice(4, 8), range(4, 8)),
+        (["all"], slice(0, 4), range(4)),
+        (["legs", "brim"], slice(2, 8), range(8)),
+    ):
+        read = read_mesh_file(path, geometries=wanted)
+        assert np.array_equal(read.mesh.vertices, whole.mesh.vertices[list(rows)])
+        triangles = read.mesh.vertices[read.mesh.faces]
+        assert np.array_equal(triangles, whole.mesh.vertices[whole.mesh.faces[faces]])
+    hat = read_mesh_file(path, geometries=["tall hat"])
+    assert [each.name for each in hat.content.surface.materials] == ["cloth"] and hat.name == "tall hat"
+    assert hat.content.surface.uvs is not None
+    assert hat.content.surface.uvs[3:6].tolist() == [[0.25, 0.75], [1, 0], [0, 0]]
+    left_out = write_posed(hat, hat.mesh.vertices * 2, tmp_path / "hat.obj")
+    assert left_out == ["other objects and groups: body, torso, all, legs"]
+    assert lines_of((tmp_path / "hat.obj").read_bytes(), b"o", b"g", b"l") == [b"o tall hat", b"g brim"]
+    assert np.allclose(read_mesh_file(tmp_path / "hat.obj").mesh.vertices, hat.mesh.vertices * 2)
+    with pytest.raises(MeshError, match="no object or group 'shoe'; it has 'body', 'tall hat', 'torso', 'all', 'legs'"):
+        read_mesh_file(path, geometries=["shoe"])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from datagen.common.errors import CheckpointError, DsffnetError, MeshError, OutOfMemory, RecipeError, StorageError
 from datagen.generate import generate
 from datagen.mesh import sequences as mesh_sequences
-from datagen.mesh.files import MeshFile, load_mesh, save_mesh
+from datagen.mesh.files import MeshFile, load_mesh, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from tests.support.commands import command, fails, process
@@ -131,20 +131,22 @@ def test_an_axis_with_a_minus_is_no_option(words: tuple[str, ...]) -> None:
     assert found.front.upper() in ("-Y", "-Y,-Y") and found.up == "-Z"
 
 
-def test_of_several_geometries_one_is_chosen(transfer: Transfer, tmp_path: Path) -> None:
+def test_several_geometries_are_one_body_or_chosen(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     person = load_mesh("person.obj")
-    bodies = {name: trimesh.Trimesh(person.vertices, person.faces, process=False) for name in ("body", "shadow")}
-    trimesh.Scene(bodies).export(tmp_path / "two.glb")
-    with pytest.raises(
-        MeshError, match=r"'body', 'shadow'. Choose one with --source-geometry NAME or --target-geometry"
-    ):
-        transfer("pose.obj", tmp_path / "two.glb", "-o", tmp_path / "x.obj")
-    both = ("--source-geometry", "shadow", "--target-geometry", "body")
-    transfer(tmp_path / "two.glb", tmp_path / "two.glb", "-o", tmp_path / "x.obj", *both)
-    transfer("person.obj", "person.obj", "-o", tmp_path / "y.obj")
-    assert np.allclose(load_mesh(tmp_path / "x.obj").vertices, load_mesh(tmp_path / "y.obj").vertices, atol=1e-4)
-    with pytest.raises(MeshError, match="is one mesh as a whole"):
+    bodies = {name: trimesh.Trimesh(person.vertices, person.faces, process=False) for name in ("body", "coat", "shoe")}
+    trimesh.Scene(bodies).export(tmp_path / "three.glb")
+    transfer("pose.obj", tmp_path / "three.glb", "-o", tmp_path / "whole.glb")
+    assert f"{tmp_path}/three.glb: 'body', 'coat', 'shoe' as one body (--target-geom" in capsys.readouterr().out
+    assert read_mesh_file(tmp_path / "whole.glb").geometries == ("body", "coat", "shoe")
+    chosen = ("--source-geometry", "coat", "--target-geometry", "body", "--target-geometry", "shoe")
+    transfer(tmp_path / "three.glb", tmp_path / "three.glb", "-o", tmp_path / "some.glb", *chosen)
+    assert read_mesh_file(tmp_path / "some.glb").geometries == ("body", "shoe")
+    with pytest.raises(MeshError, match=r"person.obj has no object or group 'hat'; it has none"):
         transfer("pose.obj", "person.obj", "-o", tmp_path / "z.obj", "--target-geometry", "hat")
+    with pytest.raises(MeshError, match="is one mesh as a whole"):
+        transfer(*(2 * ["walk/frame_0.ply"]), "-o", tmp_path / "z.obj", "--target-geometry", "hat")
 
 
 @pytest.mark.parametrize("out", ["skins/person.glb", "out/person.obj"])
