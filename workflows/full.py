@@ -19,6 +19,7 @@ if sys.path[0] != _ROOT:  # a script's own folder comes first otherwise, and its
 import argparse
 import shlex
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack
 
 from datagen.common.files import read_text_within
@@ -30,6 +31,7 @@ from training.tracking.mlflow_store import sqlite_file
 from training.tracking.record import ALIAS, EXPERIMENT, MODEL, Server, has_record, read_record, update_record
 from workflows.cli.declare import (
     add_fresh_option,
+    add_help_all,
     add_local_option,
     add_recipe_options,
     add_tracking_option,
@@ -50,7 +52,7 @@ from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse, then run the stages while a mirror keeps MLflow up to date."""
-    options = _parser().parse_args(arguments)
+    options = _parser(sys.argv[1:] if arguments is None else arguments).parse_args(arguments)
     recipe = load_recipe(options.recipe, options.set)
     out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
     folder, server = SingleRunFolder(out), server_of(out, options.tracking_uri)
@@ -63,11 +65,12 @@ def main(arguments: list[str] | None = None) -> None:
             print_text(closing_words(folder, server))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
-        description=__doc__, epilog=recipe_keys(), formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__, epilog=recipe_keys(words), formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_recipe_options(made)
+    add_help_all(made)
     made.add_argument("--out", metavar="DIR", help="folder for dataset, run and MLflow store (default runs/RECIPE)")
     add_tracking_option(made)
     add_fresh_option(made, "what DIR holds of this workflow")

@@ -265,7 +265,7 @@ FAMILIES: dict[str, Family] = {
             Target("picture", _command("inspect", "{}", "--picture", "out.png"), is_quick=False),
             Target("export", _command("export", "{}", "--layout", "obj", "--out", "out"), is_quick=False),
             Target("again", _command("generate", "--recipe", "{}", "--local", "--out", "again.zarr"), is_quick=False),
-            Target("append", _command("append", "{}", "--unseen", "6", "--local"), is_quick=False),
+            Target("append", _command("append", "{}", "--unseen-poses", "6", "--local"), is_quick=False),
             Target("recipe", _command("recipe", "--recipe", "{}")),
         ),
     ),

@@ -1,32 +1,76 @@
 """A picture of a dataset: identities down, poses across."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from datagen.common.arrays import Floats
+from datagen.grid import POSE_TYPES, SPLITS, Grid
 from datagen.mesh.geometry import bounding_box
 from datagen.store import Dataset
 from training.viz.mesh_grid import contact_sheet
 
 
 def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, poses: int = 8) -> Path:
-    """Draw some identities (rows) in some poses (columns), both spread over the whole grid.
+    """Draw some identities (rows) in some poses (columns), spread over both splits, both kinds of poses, and all steps.
 
-    Where training identities have no unseen poses, the seen ones are shown.
+    The first step is the recipe's own grid, the others are what was appended. Meshes that the dataset does not hold,
+    training identities in unseen poses, are named as such.
     """
     grid = dataset.grid
-    rows = _spread(grid.identity_count, identities)
-    common = sorted(set.intersection(*(set(grid.poses_of(identity).tolist()) for identity in rows)))
-    columns = [common[place] for place in _spread(len(common), poses)]
-    meshes = [[_standing(vertices) for vertices in dataset.vertices(i, columns)] for i in rows]
-    labels = [f"identity {i}\n{grid.split(i)}" for i in rows]
-    faces = [dataset.faces(i) for i in rows]
-    return contact_sheet(meshes, faces, labels, [f"pose {p} ({grid.pose_type(p)})" for p in columns], path)
+    rows, columns = chosen(identity_groups(grid), identities), chosen(pose_groups(grid), poses)
+    meshes = [_row(dataset, identity, columns) for identity in rows]
+    before = grid.steps[0].training + grid.steps[0].evaluation, grid.steps[0].seen + grid.steps[0].unseen
+    labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}" for i in rows]
+    headings = [f"pose {p}\n{grid.pose_type(p)}{_appended(p, before[1])}" for p in columns]
+    return contact_sheet(meshes, [dataset.faces(i) for i in rows], labels, headings, path)
+
+
+def identity_groups(grid: Grid) -> list[range]:
+    """Identity numbers of each split that each step adds."""
+    return [range(*span) for split in SPLITS for span in grid.identity_spans(split)]
+
+
+def pose_groups(grid: Grid) -> list[range]:
+    """Pose numbers of each kind that each step adds."""
+    found, first = list[range](), 0
+    for step in grid.steps:
+        for kind in POSE_TYPES:
+            found.append(range(first, first := first + getattr(step, kind)))
+    return found
+
+
+def chosen(groups: Iterable[Sequence[int]], wanted: int) -> list[int]:
+    """Return so many numbers in order, spread over each group, of which larger ones give more and none gives nothing.
+
+    Where there are more groups than numbers, some groups give one.
+    """
+    some = [group for group in groups if len(group)]
+    if len(some) > wanted:
+        some = [some[place] for place in _spread(len(some), wanted)]
+    shares = [1] * len(some)
+    while sum(shares) < wanted and any(share < len(group) for share, group in zip(shares, some, strict=True)):
+        lacking = [len(group) / share if share < len(group) else 0 for share, group in zip(shares, some, strict=True)]
+        shares[int(np.argmax(lacking))] += 1
+    return sorted(
+        group[place] for share, group in zip(shares, some, strict=True) for place in _spread(len(group), share)
+    )
 
 
 def _spread(count: int, wanted: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, wanted).astype(int)).tolist()
+
+
+def _row(dataset: Dataset, identity: int, poses: list[int]) -> list[Floats | None]:
+    """The meshes of an identity, None where the dataset has none."""
+    there = set(dataset.grid.poses_of(identity).tolist())
+    meshes = dict(zip(held := [pose for pose in poses if pose in there], dataset.vertices(identity, held), strict=True))
+    return [_standing(meshes[pose]) if pose in there else None for pose in poses]
+
+
+def _appended(number: int, before: int) -> str:
+    return ", appended" if number >= before else ""
 
 
 def _standing(vertices: Floats) -> Floats:

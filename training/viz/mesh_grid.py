@@ -24,7 +24,7 @@ _SHEET_HUES = ("#5B8CD1", "#E8995A", "#55A98F", "#B98BC6", "#D0AE48", "#CE7474")
 
 
 def contact_sheet(
-    grid: Sequence[Sequence[Floats]],
+    grid: Sequence[Sequence[Floats | None]],
     faces_per_row: Sequence[Integers],
     row_labels: Sequence[str],
     column_labels: Sequence[str],
@@ -37,7 +37,7 @@ def contact_sheet(
     Parameters
     ----------
     grid : rows of arrays [v, 3]
-        Vertices, Y up, facing +Z; rows may differ in vertex count.
+        Vertices, Y up, facing +Z; rows may differ in vertex count. None where there is no such mesh.
     faces_per_row : arrays [f, 3]
         The triangles of each row.
     row_labels, column_labels : sequence of str
@@ -47,10 +47,11 @@ def contact_sheet(
     """
     if not len(grid) == len(faces_per_row) == len(row_labels) or any(len(row) != len(column_labels) for row in grid):
         raise ValueError("grid, faces_per_row, row_labels and column_labels differ in length")
-    stood = [[standing(np.asarray(one, float)) for one in row] for row in grid]
-    camera = frame(
-        [Mesh(one, faces) for row, faces in zip(stood, faces_per_row, strict=True) for one in row], size=panel
-    )
+    stood = [[None if one is None else standing(np.asarray(one, float)) for one in row] for row in grid]
+    solid = [
+        Mesh(one, faces) for row, faces in zip(stood, faces_per_row, strict=True) for one in row if one is not None
+    ]
+    camera = frame(solid, size=panel)
     page = Page(width=90 + len(column_labels) * panel[0], height=70 + len(grid) * panel[1] + 20)
     for column, label in enumerate(column_labels):
         page.text(70 + (column + 0.5) * panel[0], 40, label, size=7.5, anchor="center", weight="bold")
@@ -59,6 +60,10 @@ def contact_sheet(
         page.text(38, top + panel[1] / 2, row_labels[index], size=7.5, anchor="center", rotation=90, weight="bold")
         hue = to_rgb(_SHEET_HUES[index % len(_SHEET_HUES)])
         for column, vertices in enumerate(row):
+            if vertices is None:
+                middle = 70 + (column + 0.5) * panel[0], top + panel[1] / 2
+                page.text(*middle, "not in the dataset", size=6.5, color=QUIET, anchor="center")
+                continue
             picture = render_mesh(vertices, faces, colors=hue, camera=camera, size=panel, background=PAGE)
             page.picture(picture, 70 + column * panel[0], top)
     return saved(page.figure, path)

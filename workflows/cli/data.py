@@ -1,6 +1,7 @@
 """The subcommands of ``dsffnet`` that make, show, check, take in and give out data."""
 
 import argparse
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,21 +31,25 @@ def declare_generate(made: Parser) -> None:
 
 def declare_append(made: Parser) -> None:
     made.add_argument("out", metavar="X.zarr", help="a complete dataset")
-    for name, what in (
-        ("training", "training identities"),
-        ("evaluation", "evaluation identities"),
-        ("seen", "poses that occur in training"),
-        ("unseen", "poses kept for evaluation"),
-    ):
-        made.add_argument(f"--{name}", type=int, metavar="TOTAL", help=f"{what}, with those that are there")
+    for option, (_, what) in _TOTALS.items():
+        made.add_argument(option, type=int, metavar="TOTAL", help=f"{what}, with those that are there")
     add_local_option(made)
     add_yes_option(made)
     add_set_option(made)
 
 
+_TOTALS = {
+    "--training-identities": ("training", "identities to train on"),
+    "--evaluation-identities": ("evaluation", "identities kept for evaluation"),
+    "--seen-poses": ("seen", "poses that occur in training"),
+    "--unseen-poses": ("unseen", "poses kept for evaluation"),
+}
+"""Options of ``append``: what the grid calls it, and what it counts."""
+
+
 def declare_inspect(made: Parser) -> None:
     made.add_argument("dataset", metavar="X.zarr")
-    made.add_argument("--picture", metavar="PNG", help="where the picture goes; none: no picture")
+    made.add_argument("--picture", metavar="PNG", help="where the picture goes (beside the dataset); none: no picture")
 
 
 def declare_verify(made: Parser) -> None:
@@ -121,14 +126,15 @@ def append_command(options: argparse.Namespace) -> None:
     """Give a dataset more identities or poses, up to these totals; nothing that is there is touched.
 
     examples:
-      dsffnet append data/quickstart.zarr --training 24
-      dsffnet append data/quickstart.zarr --evaluation 12 --unseen 400
+      dsffnet append data/quickstart.zarr --training-identities 24
+      dsffnet append data/quickstart.zarr --evaluation-identities 12 --unseen-poses 400
     """
     from datagen.generate import append, grown_recipe
 
-    totals = {name: getattr(options, name) for name in ("training", "evaluation", "seen", "unseen")}
+    given = vars(options)
+    totals = {name: given[option.lstrip("-").replace("-", "_")] for option, (name, _) in _TOTALS.items()}
     if not any(total is not None for total in totals.values()):
-        raise RecipeError("nothing to append: name at least one of --training, --evaluation, --seen, --unseen")
+        raise RecipeError(f"nothing to append: name at least one of {', '.join(_TOTALS)}")
     recipe = _own_recipe(options.out, options.set)
     grown = grown_recipe(options.out, recipe, totals)
     with _runner(options, grown, anew=grown != recipe) as how:
@@ -137,7 +143,7 @@ def append_command(options: argparse.Namespace) -> None:
 
 
 def inspect_command(options: argparse.Namespace) -> None:
-    """Show what a dataset holds, at any status, and draw identities x poses.
+    """Show what a dataset holds, at any status, and draw identities x poses beside it.
 
     examples:
       dsffnet inspect data/quickstart.zarr
@@ -150,9 +156,16 @@ def inspect_command(options: argparse.Namespace) -> None:
 
     print_facts(describe(options.dataset))
     if options.picture != "none" and is_complete(options.dataset):
-        default = f"{Path(options.dataset).name.removesuffix('.zarr')}-contact-sheet.png"
-        path = draw_contact_sheet(open_dataset(options.dataset), Path(options.picture or default))
-        print_text(f"picture: {path}")
+        place = Path(options.picture) if options.picture else _beside(options.dataset)
+        print_text(f"picture: {draw_contact_sheet(open_dataset(options.dataset), place)}")
+
+
+def _beside(dataset: str) -> Path:
+    """Where the picture of a dataset goes: beside it, or here where nothing can be written there."""
+    path = Path(dataset.rstrip("/"))
+    name = f"{path.name.removesuffix('.zarr')}-contact-sheet.png"
+    is_here = "://" in dataset or not os.access(path.parent, os.W_OK)
+    return Path(name) if is_here else path.parent / name
 
 
 def verify_command(options: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ Declaring imports nothing heavy: what a command needs is imported when it runs, 
 
 import argparse
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from workflows.recipe.names import known_recipes
@@ -16,7 +16,7 @@ _WORDS = ("result", "latest", "best")
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand: ``NAME_command``, whose docstring is its help; with ``takes_recipe`` that lists all keys, too."""
+    """A subcommand: ``NAME_command``, whose docstring is its help; with ``takes_recipe`` that lists keys, too."""
 
     run: Callable[[argparse.Namespace], None]
     add_options: Callable[[Parser], None]
@@ -27,26 +27,42 @@ class Command:
         """The word that a person types."""
         return self.run.__name__.removesuffix("_command").replace("_", "-")
 
-    def add_to(self, commands: "argparse._SubParsersAction[Parser]", *, whole: bool) -> None:
-        """Declare the subcommand; ``whole``: with its options and all of its help, not only its name."""
+    def add_to(self, commands: "argparse._SubParsersAction[Parser]", words: Sequence[str] | None) -> None:
+        """Declare the subcommand; with the words that follow it, if it is the one, its options and all of its help."""
         text = inspect.getdoc(self.run) or ""
         made = commands.add_parser(
             self.name,
             help=text.split("\n")[0],
             description=text,
-            epilog=recipe_keys() if whole and self.takes_recipe else None,
+            epilog=recipe_keys(words) if words is not None and self.takes_recipe else None,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         made.set_defaults(command=self.run)
-        if whole:
+        if words is not None:
             self.add_options(made)
+            if self.takes_recipe:
+                add_help_all(made)
 
 
-def recipe_keys() -> str:
-    """Every key of a recipe, for the end of a help text."""
-    from workflows.recipe.loader import describe_fields
+def add_help_all(made: Parser) -> None:
+    """--help-all."""
+    made.add_argument("--help-all", action="help", help="this help, with the keys of all bodies, poses and networks")
 
-    return "\n".join(["keys for --set, with their defaults:", *describe_fields()])
+
+def recipe_keys(words: Sequence[str]) -> str | None:
+    """Keys of a recipe for the end of a help text, if ``words`` ask for help: of the one that they choose, or all."""
+    if not any(word == "-h" or word.startswith("--h") for word in words):
+        return None
+    from workflows.recipe.loader import describe_fields, load_recipe
+
+    if "--help-all" in words:
+        return "\n".join(["keys for --set, with their defaults:", *describe_fields()])
+    asking = Parser(add_help=False, allow_abbrev=False)
+    add_recipe_options(asking)
+    chosen = asking.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
+    recipe = load_recipe(chosen.recipe, chosen.set)
+    head = f"keys for --set, with the values of --recipe {chosen.recipe} (other bodies and networks: --help-all):"
+    return "\n".join([head, *describe_fields(recipe=recipe)])
 
 
 def which_checkpoint(word: str) -> str | int:

@@ -34,7 +34,7 @@ def parsed(words: Sequence[str]) -> argparse.Namespace:
     )
     commands = made.add_subparsers(required=True, metavar="COMMAND")
     for command in _COMMANDS:
-        command.add_to(commands, whole=command.name in words[:1])
+        command.add_to(commands, words=words[1:] if command.name in words[:1] else None)
     return made.parse_args(_with_axes_joined(words))
 
 

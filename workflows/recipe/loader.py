@@ -138,8 +138,9 @@ def recipe_faults(where: str) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        faults = faults_text(error, _describe)
-        raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help") from error
+        is_whole = error.title == WorkflowRecipe.__name__
+        faults = faults_text(error, lambda fault: _describe(fault, is_whole=is_whole))
+        raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help-all") from error
 
 
 def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
@@ -151,9 +152,12 @@ def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
     write_atomically(path, yaml.safe_dump(recipe.model_dump(mode="json"), sort_keys=False).encode())
 
 
-def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -> Iterator[str]:
-    """One line for each key of the recipe: dotted name, default, meaning."""
+def describe_fields(
+    model: type[BaseModel] = WorkflowRecipe, prefix: str = "", *, recipe: BaseModel | None = None
+) -> Iterator[str]:
+    """One line for each key: dotted name, default, meaning; of a recipe its own values, and the kinds that it chose."""
     for name, field in model.model_fields.items():
+        value = getattr(recipe, name) if recipe else None
         is_list = get_origin(field.annotation) is tuple
         parts = [] if is_list else list(_parts(field.annotation))
         sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
@@ -162,10 +166,11 @@ def describe_fields(model: type[BaseModel] = WorkflowRecipe, prefix: str = "") -
         if sections == [TrainingRecipe]:
             names = ", ".join(known_trainings())
             yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
-        for section in sections:
-            yield from describe_fields(section, f"{prefix}{name}.")
+        for section in [kind for kind in sections if isinstance(value, kind)] or sections:
+            its = value if isinstance(value, section) else None
+            yield from describe_fields(section, f"{prefix}{name}.", recipe=its)
         if not sections:
-            default = field.get_default(call_default_factory=True)
+            default = value if recipe else field.get_default(call_default_factory=True)
             shown = (
                 [part.model_dump() for part in default]
                 if is_list and default and isinstance(default[0], BaseModel)
@@ -204,7 +209,7 @@ def _find(name_or_file: str) -> Path | dict[str, Any]:
     raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
 
 
-def _describe(fault: Any) -> str:
+def _describe(fault: Any, *, is_whole: bool) -> str:
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
     parts = zip(["", *location], location, strict=False)
@@ -215,8 +220,20 @@ def _describe(fault: Any) -> str:
             known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
         if key in known:
             return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
-        return f"unknown key {shown(key)}{nearest(key, known)}"
+        return f"unknown key {shown(key)}{nearest(key, known)}{_its_keys(location, key) if is_whole else ''}"
     return fault_text(fault, key=key)
+
+
+def _its_keys(location: list[str], key: str) -> str:
+    """Words that list the keys of the section of an unknown key, of the kind that was chosen; ``location`` names it."""
+    models: list[type[BaseModel]] = [WorkflowRecipe]
+    for part in location[:-1]:
+        chosen = [model for model in models if part in (field.default for field in model.model_fields.values())]
+        fields = [model.model_fields[part] for model in models if part in model.model_fields]
+        inner = [kind for field in fields for kind in _parts(field.annotation) if hasattr(kind, "model_fields")]
+        models = chosen or inner or models
+    keys = dict.fromkeys(name for model in models for name in model.model_fields)
+    return f" ({key.rpartition('.')[0] or 'a recipe'} has {', '.join(keys)})"
 
 
 def _parts(annotation: Any) -> Iterator[Any]:

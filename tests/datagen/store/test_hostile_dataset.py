@@ -208,7 +208,7 @@ def test_names_that_no_object_has_are_refused_and_nothing_is_touched(
 ) -> None:
     attack(spoilable)
     before = tree_hash(spoilable)
-    for command in (("verify", spoilable, "--repair"), ("append", spoilable, "--training", 5, "--local")):
+    for command in (("verify", spoilable, "--repair"), ("append", spoilable, "--training-identities", 5, "--local")):
         status, line = told(capsys, *command)
         assert status == 1 and "none of its objects. Do not trust" in line, line
     with pytest.raises(DsffnetError, match="none of its objects"):

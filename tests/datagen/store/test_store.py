@@ -257,7 +257,7 @@ def test_format_2_is_refused_with_the_command_that_makes_it_anew(
     kept = tree_hash(spoilable)
     advice = f"dsffnet generate --recipe {spoilable} --out NEW.zarr"
     for command in (
-        "generate --local --recipe smoke --out {}", "append {} --training 9 --local", "verify {}",
+        "generate --local --recipe smoke --out {}", "append {} --training-identities 9 --local", "verify {}",
         "verify {} --repair", "inspect {}", "export {} --layout obj --out unused",
     ):  # fmt: skip
         with pytest.raises(SystemExit):

@@ -46,7 +46,23 @@ def test_every_subcommand_has_help_with_an_example() -> None:
     overview = command("--help").stdout.split()
     for name in NAMES:
         assert name in overview and f"dsffnet {name}" in command(name, "--help").stdout.partition("examples:")[2]
-    assert "training.learning_rate = 0.001" in command("train", "--help").stdout
+
+
+def help_of(*words: str) -> str:
+    return command("train", *words).stdout.partition("keys for --set")[2]
+
+
+def test_help_shows_the_keys_of_what_is_chosen_and_all_of_them_on_request() -> None:
+    quickstart, human, every = help_of("--help"), help_of("--recipe", "human", "-h"), help_of("--help-all")
+    assert "training.steps = 5000" in quickstart and "--recipe quickstart" in quickstart
+    for text, there, missing in (
+        (quickstart, ("training.network.encoder_widths", "data.body.phenotypes"), ("token_width", "data.body.model")),
+        (human, ("training.network.token_width",), ("training.network.encoder_widths",)),
+        (every, ("training.network.token_width", "training.network.encoder_widths", "data.body.model"), ()),
+    ):
+        assert all(key in text for key in there) and not any(key in text for key in missing)
+    changed = help_of("--help", "--set", "training.network.name=npt", "training.steps=7")
+    assert "training.network.variant" in changed and "training.steps = 7" in changed
 
 
 def test_parsers_import_nothing_heavy() -> None:
@@ -223,8 +239,8 @@ REFUSED: list[tuple[int, str, str, dict[str, str]]] = [
     (1, "holds no record of a run", "sync .", {}),
     (1, "norun has no usable checkpoint", "evaluate norun --data leg.zarr", {}),
     (2, "nothing to append", "append leg.zarr", {}),
-    (1, "has 3 training, more than 1", "append leg.zarr --training 1 --local", {}),
-    (1, "no dataset at", "append no.zarr --training 1 --local", {}),
+    (1, "has 3 training, more than 1", "append leg.zarr --training-identities 1 --local", {}),
+    (1, "no dataset at", "append no.zarr --training-identities 1 --local", {}),
     (1, "no folder of meshes", "import faust none --out new --local", {}),
     (2, "unknown key 'upp'", "import npt . --out new --local --set data.body.upp=z", {}),
     (2, "a whole section", "import npt . --out new --local --set data=5", {}),

@@ -31,18 +31,20 @@ def made(out: Path, *extra: object) -> Path:
 
 def test_append_then_make_it_again_from_its_own_attributes(tmp_path: Path) -> None:
     data = made(tmp_path / "leg.zarr")
-    grown = command("append", data, "--training", "6", "--unseen", "20", "--local")
+    grown = command("append", data, "--training-identities", "6", "--unseen-poses", "20", "--local")
     assert grown.returncode == 0 and "6 (0-3, 7-8) training" in grown.stdout
     assert "2 training, 8 unseen" in grown.stdout
     again = command("generate", "--recipe", data, "--out", tmp_path / "again.zarr", "--local")
     assert again.returncode == 0 and tree_hash(data) == tree_hash(tmp_path / "again.zarr")
 
 
-def test_inspect_draws_beside_the_person_unless_told_otherwise(tmp_path: Path) -> None:
-    data = made(tmp_path / "leg.zarr")
-    shown = command("inspect", data, folder=tmp_path)
-    picture = tmp_path / "leg-contact-sheet.png"
-    assert "picture: leg-contact-sheet.png" in shown.stdout and picture.stat().st_size > 10_000
+def test_inspect_draws_beside_the_dataset_unless_told_otherwise(tmp_path: Path) -> None:
+    data, elsewhere = made(tmp_path / "data" / "leg.zarr"), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    shown = command("inspect", data, folder=elsewhere)
+    picture = tmp_path / "data" / "leg-contact-sheet.png"
+    assert f"picture: {picture}" in shown.stdout and picture.stat().st_size > 10_000
+    assert not list(elsewhere.iterdir())
     assert "identities          4 (0-3) training, 3 (4-6) evaluation" in shown.stdout
     picture.unlink()
     assert command("inspect", data, "--picture", "none", folder=tmp_path).returncode == 0 and not picture.exists()
@@ -91,11 +93,11 @@ def test_a_moved_model_file_is_named_when_going_on(tmp_path: Path) -> None:
     assert made.returncode == 0, made.stderr
     (tmp_path / "a.npz").rename(tmp_path / "b.npz")
     load_body.cache_clear()  # another process would not have it
-    fails(command("append", data, "--unseen", "3", "--local"), 1, "a.npz")
+    fails(command("append", data, "--unseen-poses", "3", "--local"), 1, "a.npz")
     (data / "grid/training/0/vertices/c/0/0/0/0").unlink()
     assert command("verify", data, "--repair", "--set", f"{path}/b.npz").returncode == 0
-    assert command("append", data, "--unseen", "3", "--local").returncode == 0, "the new path was kept"
-    fails(command("append", data, "--unseen", "4", "--set", "data.poses.seed=4"), 2, "can only change where")
+    assert command("append", data, "--unseen-poses", "3", "--local").returncode == 0, "the new path was kept"
+    fails(command("append", data, "--unseen-poses", "4", "--set", "data.poses.seed=4"), 2, "can only change where")
 
 
 def test_s3_without_credentials_is_one_error(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_the_size_is_the_first_thing_said_and_only_where_there_is_something_to_m
     assert "] generate: 34 meshes of 96 vertices, " in capsys.readouterr().out.splitlines()[0]
     generate(tmp_path / "x.zarr")
     assert "generate:" not in capsys.readouterr().out
-    cli.main(["append", str(tmp_path / "x.zarr"), "--unseen", "3", "--local"])
+    cli.main(["append", str(tmp_path / "x.zarr"), "--unseen-poses", "3", "--local"])
     assert "] generate: 37 meshes of 96 vertices, " in capsys.readouterr().out.splitlines()[0]
 
 
@@ -58,7 +58,7 @@ def test_a_disk_that_is_too_small_is_said_before_anything_is_made_and_yes_goes_o
     generate(tmp_path / "x.zarr", "--yes")
     capsys.readouterr()
     generate(tmp_path / "x.zarr")  # there is nothing to make
-    append = ["append", str(tmp_path / "x.zarr"), "--training", "60", "--local"]
+    append = ["append", str(tmp_path / "x.zarr"), "--training-identities", "60", "--local"]
     refused(lambda: cli.main(append), 1, "its disk has 1.0 kB left", capsys)
 
 
@@ -92,8 +92,10 @@ def test_a_million_million_identities_are_refused_by_every_command(
 
 
 def test_appending_a_million_million_is_refused(spoilable: Path, capsys: Printed) -> None:
-    refused(lambda: cli.main(["append", str(spoilable), "--seen", str(10**12), "--local"]), 2, "Lower data.", capsys)
-    refused(lambda: cli.main(["append", str(spoilable), "--seen", "9" * 400, "--local"]), 2, "has 63", capsys)
+    refused(
+        lambda: cli.main(["append", str(spoilable), "--seen-poses", str(10**12), "--local"]), 2, "Lower data.", capsys
+    )
+    refused(lambda: cli.main(["append", str(spoilable), "--seen-poses", "9" * 400, "--local"]), 2, "has 63", capsys)
 
 
 @pytest.mark.parametrize(

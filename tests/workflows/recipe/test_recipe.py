@@ -61,7 +61,12 @@ def test_saved_and_read_again_it_is_the_same(tmp_path: Path) -> None:
     [
         (["training.learning_rat=1"], r"unknown key 'training.learning_rat', did you mean 'training.learning_rate'\?"),
         (["data.body.topolgy=anny"], r"unknown key 'data.body.topolgy', did you mean 'data.body.topology'\?"),
-        (["trainig.steps=5"], r"unknown key 'trainig', did you mean 'training"),
+        (
+            ["trainig.steps=5"],
+            r"unknown key 'trainig', did you mean 'training.*\(a recipe has description, data, train",
+        ),
+        (["data.poses.sen=5"], r"unknown key 'data.poses.sen', .* \(data.poses has seen, unseen, distribution, seed\)"),
+        (["training.network.name=npt", "training.network.witdh=5"], r"\(training.network has name, variant.*\)\. All"),
         (["training.batch=many"], r"training.batch: .*integer.*\(given: 'many'\)"),
         (["training.batch=0"], r"training.batch: .*greater than or equal to 1 \(given: 0\)"),
         (["training.batch=9"], r"batch 9 cannot be shared equally by 2 ranks"),
@@ -159,7 +164,7 @@ def test_what_does_not_fit_together_is_one_line_without_the_whole_section() -> N
     with pytest.raises(RecipeError) as raised:
         load_recipe("quickstart", ["training.batch=9"])
     assert str(raised.value) == (
-        "recipe quickstart: training: batch 9 cannot be shared equally by 2 ranks. All keys: dsffnet recipe --help"
+        "recipe quickstart: training: batch 9 cannot be shared equally by 2 ranks. All keys: dsffnet recipe --help-all"
     )
 
 
