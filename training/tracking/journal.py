@@ -132,7 +132,9 @@ def _drop_torn_line(path: Path) -> None:
 
 
 def coefficient_metrics(network: object) -> dict[str, float]:
-    """Alpha and beta of every FFAdaIN (the adaptive coefficients) as ``alpha/block1.norm1`` and so on.
+    """Alpha and beta of every FFAdaIN (the adaptive coefficients) as ``modulation/alpha/block1.norm1`` and so on.
+
+    Charts of MLflow stand in the order of these names: evaluation, loss, modulation.
 
     Empty for a network without ``adaptive_coefficients()``. A wrapper such as DistributedDataParallel is looked into.
     """
@@ -140,4 +142,4 @@ def coefficient_metrics(network: object) -> dict[str, float]:
     if not hasattr(inner, "adaptive_coefficients"):
         return {}
     named = ((*name.rpartition("."), value) for name, value in inner.adaptive_coefficients().items())
-    return {f"{kind}/{place}" if place else kind: float(value) for place, _, kind, value in named}
+    return {"/".join(filter(None, ("modulation", kind, place))): float(value) for place, _, kind, value in named}

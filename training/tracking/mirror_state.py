@@ -33,6 +33,7 @@ class Sent(TypedDict):
     metrics: NotRequired[dict[str, float]]
     dataset: NotRequired[str]
     model: NotRequired[str]
+    about: NotRequired[str]
     status: NotRequired[str]
 
 

@@ -20,6 +20,7 @@ from datagen.common.errors import DsffnetError, TrackingError, UnsafeFileError
 from datagen.common.files import lock_within
 from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
+from training.tracking.mlflow_pages import EXPERIMENT_TAGS, mark_experiment
 from training.tracking.mlflow_store import prepare_store, require_inside
 from training.tracking.model_registry import Registration
 from training.tracking.record import EXPERIMENT, Record, Server, find_records, parent_of, read_record
@@ -58,6 +59,7 @@ def publish(root: Path, server: Server) -> None:
         prepare_store(server)
         mlflow.set_tracking_uri(server.uri)
         client = mlflow.MlflowClient(server.uri)
+        _experiment(client, server, mark=True)
         for folder in find_records(root):
             _publish_record(client, server, folder, failures)
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
@@ -122,6 +124,9 @@ class _Publication:
         self._send_artifacts()
         if self.record.model and self.record.status == "FINISHED":
             self._once("model", self._register_model)
+            if self.record.model_about != self.sent.get("about", ""):
+                self._registration().describe(self.record.model, self.record.model_about)
+                self._note(about=self.record.model_about)
         if self.record.status != self.sent.get("status"):
             self._send_status()
 
@@ -165,12 +170,16 @@ class _Publication:
 
     def _create_run(self, experiment: str) -> None:
         tags = {"kind": self.record.kind, _RECORD_TAG: self._id}
-        parent = parent_of(self.folder, self.record)
-        known = read_sent(parent, self.server.uri) if parent else {}
-        if known:  # a run that was copied away from its workflow stands alone
-            tags[_PARENT_TAG] = known["run"]
+        parent = self._parent()
+        if parent:
+            tags[_PARENT_TAG] = parent
         name = printable(self.record.name)[:_LONGEST_NAME]
         self.client.create_run(experiment, start_time=self.record.started, run_name=name, tags=tags)
+
+    def _parent(self) -> str | None:
+        """The parent's run; None for a run that was copied away from its workflow, which stands alone."""
+        parent = parent_of(self.folder, self.record)
+        return read_sent(parent, self.server.uri).get("run") if parent else None
 
     def _send_parameters(self, there: Any) -> None:
         """Parameters that the server lacks; it lets none change, so what a resumed run has otherwise becomes a tag."""
@@ -236,10 +245,12 @@ class _Publication:
             self._note()
 
     def _register_model(self) -> None:
+        self._registration().register(self.record.model or "", parent=self._parent())
+
+    def _registration(self) -> Registration:
         marks = {_RECORD_TAG: self._id, _WEIGHTS_TAG: self.record.model_version}
         experiment = _experiment(self.client, self.server)
-        name = self.record.model or ""
-        Registration(self.client, experiment, self.sent["run"], self.folder, marks).register(name)
+        return Registration(self.client, experiment, self.sent["run"], self.folder, marks)
 
     def _send_status(self) -> None:
         if self.record.status == "RUNNING":
@@ -273,11 +284,15 @@ def _value(text: str) -> str:
     return printable_lines(text)[:_LONGEST_PARAMETER]
 
 
-def _experiment(client: Any, server: Server) -> str:
+def _experiment(client: Any, server: Server, *, mark: bool = False) -> str:
+    """The experiment's id; it is made where it is not there, and with ``mark`` gets the tags that it lacks."""
     found = client.get_experiment_by_name(EXPERIMENT)
-    if found is not None:
-        return str(found.experiment_id)
-    return str(client.create_experiment(EXPERIMENT, server.artifacts.as_uri() if server.artifacts else None))
+    if found is None:
+        place = server.artifacts.as_uri() if server.artifacts else None
+        return str(client.create_experiment(EXPERIMENT, place, tags=EXPERIMENT_TAGS))
+    if mark:
+        mark_experiment(client, found)
+    return str(found.experiment_id)
 
 
 class Mirror:

@@ -85,6 +85,13 @@ def prepare_store(server: Server) -> None:
         _refuse_places_elsewhere(database, server)
 
 
+def experiment_in(database: Path) -> str | None:
+    """The number of this project's experiment in a SQLite store, by which MLflow's pages are addressed."""
+    with _opened(database) as connection:
+        found = connection.execute("SELECT experiment_id FROM experiments WHERE name = ?", [EXPERIMENT]).fetchone()
+    return str(found[0]) if found else None
+
+
 def require_inside(place: object, server: Server) -> None:
     """Refuse a place of artifacts, as MLflow notes it, that is not in the folder of a store that is the folder's own.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.common.files import read_within, resolve_within
+from training.tracking.mlflow_pages import MODEL_DESCRIPTION, how_to_call
 from training.tracking.record import ALIAS
 
 _ROOT = Path(__file__).parents[2]
@@ -27,13 +28,32 @@ class Registration:
     folder: Path
     marks: dict[str, str]
 
-    def register(self, name: str) -> None:
-        """Log and register the weights, unless a kill came between that and the note; give them the alias."""
+    def register(self, name: str, *, parent: str | None = None) -> None:
+        """Log and register the weights, unless a kill came between that and the note; give them the alias.
+
+        ``parent``: the run that is to show the model, too.
+        """
         version = self._registered_version(name)
         if version is None:
             source, model = self._logged_model() or self._log_model()
+            if parent:
+                self._show_in(parent, model)
             version = self._register_version(name, source, model)
         self.client.set_registered_model_alias(name, ALIAS, version)
+
+    def describe(self, name: str, about: str) -> None:
+        """Give the registered version its description: what is said about it, and how it is called."""
+        version = self._registered_version(name)
+        if version is not None:
+            text = f"{about}\n\n{how_to_call(f'models:/{name}/{version}')}"
+            self.client.update_model_version(name, version, description=text)
+
+    def _show_in(self, run: str, model: str) -> None:
+        from mlflow.entities import LoggedModelOutput
+
+        outputs = self.client.get_run(run).outputs
+        if model not in [each.model_id for each in (outputs.model_outputs if outputs else ())]:
+            self.client.log_outputs(run, [LoggedModelOutput(model, step=0)])
 
     def _registered_version(self, name: str) -> str | None:
         found = self.client.search_model_versions(f"run_id='{self.run}'")
@@ -79,7 +99,8 @@ class Registration:
         from mlflow.exceptions import MlflowException
 
         try:
-            self.client.create_registered_model(name)
+            call = how_to_call(f"models:/{name}@{ALIAS}")
+            self.client.create_registered_model(name, description=MODEL_DESCRIPTION.format(call=call))
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise

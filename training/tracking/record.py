@@ -50,6 +50,7 @@ class Record:
     ``artifacts`` are names of files and folders inside the record's folder.
     ``id`` is unique; servers are asked for it before a run is created, so that none is created twice.
     ``model`` is the registered name of the run's weights; it is registered again when ``model_version`` changes.
+    ``model_about`` (Markdown) says of them on what they were trained and what they score.
     ``measured`` is when ``metrics`` changed, and times are in milliseconds since 1970.
     """
 
@@ -64,6 +65,7 @@ class Record:
     artifacts: list[str] = field(default_factory=list)
     model: str | None = None
     model_version: str = ""
+    model_about: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
     measured: Milliseconds | None = None
     status: Status = "RUNNING"

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datagen.common.errors import DatasetError, DsffnetError
-from training.tracking.mlflow_store import prepare_store, sqlite_server
+from training.tracking.mlflow_pages import page_addresses
+from training.tracking.mlflow_store import experiment_in, prepare_store, sqlite_server
 from workflows.cli.declare import Command, Parser
 
 _LOOK_SECONDS = 0.3
@@ -34,8 +35,9 @@ def ui_command(options: argparse.Namespace) -> None:
             f"{database} is not there yet: python workflows/full.py makes it; for another folder: dsffnet ui FOLDER"
         )
     _require_free(options.port)
-    print(f"MLflow: http://127.0.0.1:{options.port}   (ready in some seconds; Ctrl-C ends it)", flush=True)
-    status = _serve(_server(database, options.port), ended=_parent_is_gone())
+    server = _server(database, options.port)
+    print(_addresses(database, options.port), flush=True)
+    status = _serve(server, ended=_parent_is_gone())
     if status:
         raise PageError(f"MLflow's server ended with status {status}; its words are above")
 
@@ -47,6 +49,15 @@ def _server(database: Path, port: int) -> list[str]:
         *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
         *("--backend-store-uri", server.uri, "--artifacts-destination", str(server.artifacts)),
     ]
+
+
+def _addresses(database: Path, port: int) -> str:
+    """Where the runs and the model are among MLflow's pages."""
+    base = f"http://127.0.0.1:{port}"
+    experiment = experiment_in(database)
+    pages = page_addresses(base, experiment) if experiment else {"MLflow": base}
+    lines = [f"{name:8}{address}" for name, address in pages.items()]
+    return "\n".join([*lines, "Ready in some seconds; Ctrl-C ends it."])
 
 
 def _require_free(port: int) -> None:

@@ -13,12 +13,12 @@ from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import Which
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_rows, triples_in, write_rows
 from training.evaluation.paper_numbers import method_name
-from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_of, report
+from training.evaluation.tables import COLUMNS, about_model, about_weights, mean_of, methods_of, report
 from training.inference.predict import load_trained
 from training.inference.projection import PROJECTED, OntoParts
-from training.recipes.training import EvaluationRecipe
+from training.recipes.training import EvaluationRecipe, TrainingRecipe
 from training.reports.examples import comparisons_of, draw_comparisons, draw_training_curve
-from training.tracking.record import Record, flatten, read_record, update_record
+from training.tracking.record import Record, flatten, has_record, read_record, update_record
 from workflows.pipeline.generate import CONTENT, about_dataset
 from workflows.pipeline.progress import bar, sampling
 from workflows.pipeline.run_folder import EvaluationFolder, RunFolder
@@ -50,7 +50,8 @@ def evaluate_weights(
         Another run, measured on the same triples.
     """
     dataset, what = open_dataset(data), evaluated(place, which)
-    shown = _shown([what, *([evaluated(beside)] if beside else [])])
+    weights = [what, *([evaluated(beside)] if beside else [])]
+    shown = _shown(weights)
     main = next(iter(shown))
     methods = [one.method for one in shown.values()]
     if project:
@@ -73,6 +74,8 @@ def evaluate_weights(
         if RunFolder(what.home).journal.exists():  # exported weights have none
             draw_training_curve(what.home, folder.curve, baselines=_no_ops(rows))
         end_evaluation(folder, dataset, rows, ARTIFACTS, main=main)
+        for each, (name, one) in zip(weights, shown.items(), strict=True):
+            _describe_model(each, one, name, dataset, rows)
     return text
 
 
@@ -82,6 +85,7 @@ class _Shown(NamedTuple):
     method: Method
     network: nn.Module
     step: int
+    recipe: TrainingRecipe
 
 
 def _shown(weights: Sequence[Evaluated]) -> dict[str, _Shown]:
@@ -91,8 +95,16 @@ def _shown(weights: Sequence[Evaluated]) -> dict[str, _Shown]:
         network, trained, step = load_trained(each.weights)
         name = method_name(trained.network)
         name = f"{name} beside" if name in found else name
-        found[name] = _Shown(Method(name, str(each.weights)), network, step)
+        found[name] = _Shown(Method(name, str(each.weights)), network, step, trained)
     return found
+
+
+def _describe_model(weights: Evaluated, shown: _Shown, name: str, dataset: Dataset, rows: list[Row]) -> None:
+    """Let a run's registered model say what it scores, where these rows are of its result, on its own data."""
+    run = RunFolder(weights.home)
+    if weights.folder(dataset) == run.evaluation.path and has_record(run.path):
+        pmd = {each: mean_of(rows, method=name, pose_type=each, field="pmd") for each in _types(rows)}
+        update_record(run.path, model_about=about_model(shown.recipe.network, shown.step, dataset, pmd))
 
 
 def end_evaluation(
@@ -156,11 +168,15 @@ def summary_metrics(rows: list[Row], *, main: str = "") -> dict[str, float]:
     found = {}
     for method in methods_of(rows):
         prefix = "" if method == main else f"{method.replace(' ', '_')}/"
-        for pose_type in sorted({row.pose_type for row in rows}):
+        for pose_type in _types(rows):
             for column in COLUMNS:
                 mean = mean_of(rows, method=method, pose_type=pose_type, field=column.field)
                 found[f"{prefix}{column.field}_{pose_type}"] = mean * column.factor
     return found
+
+
+def _types(rows: list[Row]) -> list[str]:
+    return sorted({row.pose_type for row in rows})
 
 
 def _title(dataset: Dataset) -> str:

@@ -18,10 +18,12 @@ from training.checkpoints.checkpoint import is_finished, load_checkpoint, requir
 from training.data.triples import last_step_of, order_of
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
+from training.evaluation.tables import about_model
 from training.inference.domain_check import noted, seen_in
 from training.recipes.training import TrainingRecipe
 from training.reports.examples import draw_training_curve
 from training.reports.plots.training_curve import draw_coefficients
+from training.tracking.journal import read_journal
 from training.tracking.provenance import write_run_head
 from training.tracking.record import MODEL, update_record
 from workflows.pipeline.generate import about_dataset, is_complete
@@ -58,6 +60,7 @@ def train_model(
             train_run(placed, dataset, run)
         _say_where_meshes_were(run.path)
         draw_coefficients(run.path, run.coefficients)
+        step = require_checkpoint(run.path, "result").step
         update_record(
             run.path,
             artifacts=[
@@ -65,7 +68,8 @@ def train_model(
                 *(name for name in ("metrics.jsonl", "figures", "pictures") if (run.path / name).exists()),
             ],
             model=model,
-            model_version=f"{dataset.uuid} step {require_checkpoint(run.path, 'result').step}",
+            model_version=f"{dataset.uuid} step {step}",
+            model_about=about_model(recipe.network, step, dataset, _pmd_at(step, run)),
         )
 
 
@@ -101,6 +105,13 @@ def train_run(recipe: TrainingRecipe, dataset: Dataset, run: RunFolder) -> None:
             f"training in {run.path} ended at step {reached.step} of {last}. Run the same command again to resume"
         )
     draw_training_curve(run.path, run.curve, baselines={})
+
+
+def _pmd_at(step: int, run: RunFolder) -> dict[str, float]:
+    """PMD by pose type as the training measured it last up to a step."""
+    rows = [row for row in read_journal(run.journal) if row["step"] <= step]
+    found = {key: value for row in rows for key, value in row.items() if key.startswith("evaluation/pmd_")}
+    return {key.removeprefix("evaluation/pmd_"): value for key, value in found.items()}
 
 
 def _say_where_meshes_were(run: Path) -> None:

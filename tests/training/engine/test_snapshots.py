@@ -86,9 +86,10 @@ def test_a_broken_network_is_drawn_as_it_is(batch: Batch, faces: np.ndarray, tmp
 def test_coefficients_are_drawn_a_panel_a_block(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "metrics.jsonl")
     for step in range(0, 100, 10):
-        names = [f"{kind}/block{b}.norm{n}" for kind in ("alpha", "beta") for b in (1, 2, 3, 4) for n in (1, 2)]
+        places = [f"block{b}.norm{n}" for b in (1, 2, 3, 4) for n in (1, 2)]
+        names = [f"modulation/{kind}/{place}" for kind in ("alpha", "beta") for place in places]
         journal.write(step, {name: np.sin(step / 30 + place) / 5 for place, name in enumerate(names)})
-    journal.write(100, {"loss/total": 1.0, "alpha/block1.norm1": float("nan")})
+    journal.write(100, {"loss/total": 1.0, "modulation/alpha/block1.norm1": float("nan")})
     journal.close()
     path = draw_coefficients(tmp_path, tmp_path / "figures" / "coefficients.png")
     assert path is not None

@@ -126,7 +126,8 @@ def test_coefficients_under_the_names_of_their_curves() -> None:
     with torch.no_grad():
         network.get_parameter("decoder.block1.norm2.alpha").fill_(0.5)
     found = coefficient_metrics(network)
-    assert found["alpha/block1.norm2"] == 0.5 and found["beta/block3.norm1"] == 0.0 and len(found) == 12
+    assert found["modulation/alpha/block1.norm2"] == 0.5 and found["modulation/beta/block3.norm1"] == 0.0
+    assert len(found) == 12
     assert coefficient_metrics(nn.ModuleDict({"module": network})["module"]) == found
     assert coefficient_metrics(nn.Linear(2, 2)) == {}
 

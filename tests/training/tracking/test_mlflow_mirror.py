@@ -23,6 +23,7 @@ from training.inference.transfer import PoseTransfer
 from training.tracking import mlflow_mirror as tracking
 from training.tracking.journal import Journal
 from training.tracking.mlflow_mirror import Mirror, publish
+from training.tracking.mlflow_store import experiment_in
 from training.tracking.record import (
     ALIAS,
     EXPERIMENT,
@@ -95,6 +96,21 @@ def test_a_clock_that_was_put_back_gives_no_run_that_ends_before_it_began(root: 
     child = runs_of(server)["train"]
     assert child.info.end_time >= child.info.start_time == started
     assert [step for step, _ in history(server, child, "loss/total")] == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_experiment_is_shown_as_training_with_columns_of_pmd(root: Path, server: Server) -> None:
+    client = mlflow.MlflowClient(server.uri)
+    before = client.create_experiment(EXPERIMENT, tags={"mlflow.experimentKind": "a choice of a person's"})
+    publish(root, server)
+    tags = client.get_experiment(before).tags
+    view = json.loads(tags["mlflow.sharedViewState.dsffnet"])
+    assert "metrics.`pmd_unseen`" in json.loads(view["state"])["selectedColumns"], "which full.py gives the parent"
+    assert tags["mlflow.experimentKind"] == "a choice of a person's"
+    client.rename_experiment(before, "another")
+    publish(root, server)
+    made = client.get_experiment_by_name(EXPERIMENT)
+    assert made.tags["mlflow.experimentKind"] == "custom_model_development"
+    assert experiment_in(server.artifacts.parent / "mlflow.db") == made.experiment_id
 
 
 def artifacts_of(server: Server, run: Any, folder: str | None = None) -> set[str]:
@@ -391,12 +407,13 @@ def test_two_processes_that_publish_at_once_make_one_run(root: Path, server: Ser
 def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Server) -> None:
     """The registered model loads by alias and poses a mesh; the dataset shows as the run's input."""
     run, opened = tmp_path / "run", open_dataset(dataset)
+    begin_record(tmp_path, name="whole", kind="workflow", parent=None, parameters={})
     train(tiny_training(), data=dataset, run=run)
     note = {"vertices": [7, 9], "proportions": [[0.1] * 3, [1.0] * 3]}
     (run / "provenance.json").write_text(json.dumps({"seen": note}))
-    begin_record(run, name="train", kind="train", parent=None, parameters={})
+    begin_record(run, name="train", kind="train", parent=tmp_path, parameters={})
     about = {"name": "leg.zarr", "uuid": opened.uuid, "manifest_sha256": opened.attributes["manifest_sha256"]}
-    update_record(run, model="dsffnet", dataset=about)
+    update_record(run, model="dsffnet", dataset=about, model_about="PMD 7.5e-4")
     end_record(run, "FINISHED")
     publish(run, server)
     mlflow.set_tracking_uri(server.uri)
@@ -417,7 +434,21 @@ def test_dataset_and_registered_model(dataset: str, tmp_path: Path, server: Serv
     assert np.allclose(fetched.vertices, posed, atol=1e-6)
     (given,) = runs_of(server)["train"].inputs.dataset_inputs
     assert given.dataset.digest == about["manifest_sha256"][:36] and given.dataset.name == "leg.zarr"
+    _described(run, server)
     _never_registered_twice(run, server)
+
+
+def _described(run: Path, server: Server) -> None:
+    """The parent shows the model, whose version says what it scores and how it is called; also what changes later."""
+    client = mlflow.MlflowClient(server.uri)
+    (shown,) = runs_of(server)["whole"].outputs.model_outputs
+    version = client.get_model_version_by_alias("dsffnet", ALIAS)
+    assert version.source == f"models:/{shown.model_id}"
+    assert "PMD 7.5e-4" in version.description and 'load_model("models:/dsffnet/1")' in version.description
+    assert f'load_model("models:/dsffnet@{ALIAS}")' in client.get_registered_model("dsffnet").description
+    update_record(run, model_about="PMD 3.5e-4")
+    publish(run, server)
+    assert "PMD 3.5e-4" in client.get_model_version("dsffnet", "1").description
 
 
 def _never_registered_twice(run: Path, server: Server) -> None:
@@ -441,6 +472,7 @@ def _never_registered_twice(run: Path, server: Server) -> None:
     assert version.source == f"models:/{model.model_id}" != f"models:/{half.model_id}", (
         "the whole model was adopted, the half one removed"
     )
+    assert len(runs_of(server)["whole"].outputs.model_outputs) == 1
 
 
 def test_flatten() -> None:

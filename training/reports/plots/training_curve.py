@@ -98,12 +98,12 @@ class _Curve:
 
 
 def _coefficients(rows: Sequence[Mapping[str, float]]) -> list[_Curve]:
-    """Return the curves under alpha/BLOCK.NORM and beta/BLOCK.NORM; a norm has a colour, beta is dashed."""
-    keys = sorted({key for row in rows for key in row if key.startswith(("alpha/", "beta/"))})
+    """Return the curves modulation/KIND/BLOCK.NORM of alpha and beta; a norm has a colour, beta is dashed."""
+    keys = sorted({key for row in rows for key in row if key.startswith(("modulation/alpha/", "modulation/beta/"))})
     norms = sorted({key.rpartition(".")[2] for key in keys})
     found = []
     for key in keys:
-        kind, _, place = key.partition("/")
+        _, kind, place = key.split("/", 2)
         block, _, norm = place.rpartition(".")
         color = _NORM_COLORS[norms.index(norm) % len(_NORM_COLORS)]
         label = f"{'α' if kind == 'alpha' else 'β'} {norm}"
