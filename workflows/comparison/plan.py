@@ -31,7 +31,7 @@ class ComparisonFile(Frozen):
     """A comparison as YAML: what all methods share, and the methods in the order of the tables."""
 
     description: str = Field("", description="one line for people")
-    recipe: str = Field("quickstart", description="name or file of the recipe that all start from")
+    recipe: str = Field("dsffnet-small", description="name or file of the recipe that all start from")
     set: tuple[str, ...] = Field((), description="words section.key=value that all methods share")
     methods: tuple[MethodEntry, ...] = Field(min_length=1, description="what is trained")
 

@@ -148,7 +148,7 @@ def plan_sweep(
     Parameters
     ----------
     recipe
-        Name or file of the recipe; None: the file's, or the quickstart's.
+        Name or file of the recipe; None: the file's, or `dsffnet-small`.
     shared
         Words ``section.key=value`` for all trials; they come after the file's own, and before a trial's.
     vary
@@ -162,7 +162,7 @@ def plan_sweep(
         Nothing to try, a key that is not there, a value that cannot be, two trials of one name, an unreadable file.
     """
     file = read_sweep(trials) if trials else SweepFile()
-    name, words = recipe or file.recipe or "quickstart", (*file.set, *shared)
+    name, words = recipe or file.recipe or "dsffnet-small", (*file.set, *shared)
     entries = list(_combined(file.trials, parse_grid([*file.vary, *vary])))
     if not entries:
         raise RecipeError(

@@ -54,7 +54,7 @@ def help_of(*words: str) -> str:
 
 def test_help_shows_the_keys_of_what_is_chosen_and_all_of_them_on_request() -> None:
     quickstart, human, every = help_of("--help"), help_of("--recipe", "human", "-h"), help_of("--help-all")
-    assert "training.steps = 5000" in quickstart and "--recipe quickstart" in quickstart
+    assert "training.steps = 2500" in quickstart and "--recipe quickstart" in quickstart
     for text, there, missing in (
         (quickstart, ("training.network.encoder_widths", "data.body.phenotypes"), ("token_width", "data.body.model")),
         (human, ("training.network.token_width",), ("training.network.encoder_widths",)),

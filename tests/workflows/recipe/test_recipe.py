@@ -32,6 +32,10 @@ def test_the_quickstart_is_what_the_readme_says() -> None:
     assert recipe.data.identities.training == 16 and recipe.data.poses.seen >= 200
     assert recipe.data.identities.evaluation >= 8 and recipe.data.poses.unseen > 0
     assert recipe.training.ranks == 2 and recipe.training.launcher == "auto"
+    assert recipe.beside is not None and (recipe.training.network.name, recipe.beside.network.name) == (
+        "dsffnet",
+        "parts",
+    )
 
 
 def test_defaults_are_the_papers() -> None:
@@ -77,29 +81,31 @@ def test_saved_and_read_again_it_is_the_same(tmp_path: Path) -> None:
 )
 def test_mistakes_are_named(overrides: list[str], message: str) -> None:
     with pytest.raises(RecipeError, match=message):
-        load_recipe("quickstart", overrides)
+        load_recipe("dsffnet-small", overrides)
 
 
 def test_a_network_is_chosen_by_name_and_the_keys_of_another_do_not_stay() -> None:
-    chosen = load_recipe("quickstart", ["training.network.name=npt", "training.network.variant=origin"])
+    chosen = load_recipe("dsffnet-small", ["training.network.name=npt", "training.network.variant=origin"])
     assert chosen.training.network.model_dump() == {
-        "name": "npt", "variant": "origin", "encoder_widths": (64, 128, 1024),
+        "name": "npt", "variant": "origin", "encoder_widths": (64, 128, 1024), "norm_weights": "uniform",
     }  # fmt: skip
-    plain = load_recipe("quickstart")
-    assert load_recipe("quickstart", ["training.network.name=dsffnet"]) == plain  # what no name means: nothing changes
+    plain = load_recipe("dsffnet-small")
+    assert (
+        load_recipe("dsffnet-small", ["training.network.name=dsffnet"]) == plain
+    )  # what no name means: nothing changes
     with pytest.raises(RecipeError, match=r"training.network: .*'nptt'.*'dsffnet', 'npt'"):
-        load_recipe("quickstart", ["training.network.name=nptt"])
+        load_recipe("dsffnet-small", ["training.network.name=nptt"])
     with pytest.raises(
         RecipeError, match=r"'training.network.decoder_widths' is a key of another kind of 'training.net"
     ):
-        load_recipe("quickstart", ["training.network.name=npt", "training.network.decoder_widths=[8,8,8]"])
+        load_recipe("dsffnet-small", ["training.network.name=npt", "training.network.decoder_widths=[8,8,8]"])
 
 
 @pytest.mark.parametrize("name", sorted(known_trainings()))
 def test_a_published_training_stands_for_the_whole_section_over_any_recipe(name: str) -> None:
-    published = load_recipe("quickstart", [f"training={name}"])
+    published = load_recipe("dsffnet-small", [f"training={name}"])
     assert published.training == load_recipe("smal-paper", [f"training={name}"]).training
-    assert published.data == load_recipe("quickstart").data
+    assert published.data == load_recipe("dsffnet-small").data
     assert published.training.network.model_dump() == type(published.training.network)().model_dump()
 
 
