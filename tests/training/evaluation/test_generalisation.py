@@ -122,6 +122,9 @@ def test_heat_map_and_picture_are_drawn(
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3).astype(int)
         assert (np.abs(pixels - (209, 70, 47)).sum(1) < 12).sum() > 300, "the trained kind is framed"
         assert (np.abs(pixels - (236, 238, 241)).sum(1) < 3).sum() > 5000, "what has no truth is grey"
+    both = [*rows, *(replace(row, method=f"{row.method} again") for row in rows if row.method != NO_OP)]
+    with Image.open(heat_map(both, names, tmp_path / "two.png", title="tiny", trained=[names[1]] * 2)) as wide:
+        assert wide.width > 1.4 * picture.width
     case = cases_between(kinds[0], kinds[1], 1)[0]
     shown = [Shown("with", case), Shown("without", case, truth_known=False)]
     with Image.open(generalisation_picture(shown, [method], tmp_path / "pairs.png", title="tiny")) as picture:

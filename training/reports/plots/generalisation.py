@@ -88,8 +88,9 @@ def _draw_grid(axes: Axes, grid: NDArray[np.float64], kinds: Sequence[str], norm
     if own in kinds:
         place = kinds.index(own)
         axes.add_patch(Rectangle((place - 0.5, place - 0.5), 1, 1, fill=False, edgecolor="#d1462f", linewidth=1.8))
-        for label in (axes.get_xticklabels()[place], axes.get_yticklabels()[place]):
-            label.set_fontweight("bold")
+        for labels in (axes.get_xticklabels(), axes.get_yticklabels()):  # a second grid has none of the latter
+            for label in labels[place : place + 1]:
+                label.set_fontweight("bold")
 
 
 def _broken(name: str) -> str:
