@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from training.viz.close_up import CloseUp, close_up_size, outlined
 from training.viz.render.camera import Camera
 from training.viz.render.renderer import render_mesh
 from training.viz.style import PAGE, ROLE_COLORS, error_colors
-from training.viz.transfer_example import Comparison, camera_of, in_view, output_of
+from training.viz.transfer_example import Comparison, camera_of, in_view, look_at, output_of
 
 SIDE = 20  # pixels of margin
 _AIR = 8  # pixels left free above and below what a strip shows
@@ -106,11 +107,14 @@ class ShownRow:
         return Strip.of(found)
 
     def picture(self, column: str, camera: Camera, size: tuple[int, int]) -> Picture | None:
-        """The mesh of a column in the colour of its role; None where there is none."""
+        """The mesh of a column as its file has it, else in the colour of its role; None where there is none."""
         if column not in self.meshes:
             return None
         mesh, color = self.meshes[column], ROLE_COLORS[column.partition(" ")[0]]
-        return render_mesh(mesh.vertices, mesh.faces, colors=color, camera=camera, size=size, background=PAGE)
+        how: dict[str, Any] = {"camera": camera, "size": size, "background": PAGE}
+        return render_mesh(
+            mesh.vertices, mesh.faces, colors=color, look=look_at(self.comparison.meshes()[column]), **how
+        )
 
     def heat(self, method: str, camera: Camera, size: tuple[int, int], limit: float) -> Picture | None:
         """A method's output in the colours of its errors; None where there are none."""

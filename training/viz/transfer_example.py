@@ -1,12 +1,13 @@
 """One transfer by one method or several: what the figures and the viewer draw."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, standing_point
+from training.viz.look import Look
 from training.viz.render.camera import Camera, MeshLike, azimuth_of, frame
 
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
@@ -28,6 +29,8 @@ class Comparison:
         The right mesh, vertex by vertex, where it is known.
     metrics : dict
         Name of a method -> few words to stand under its picture, for example ``"PMD 12.3e-4"``.
+    motion : Motion, optional
+        Frames that begin with this transfer, for the viewer; of one method.
     """
 
     title: str
@@ -36,12 +39,21 @@ class Comparison:
     outputs: Mapping[str, MeshLike]
     truth: MeshLike | None = None
     metrics: Mapping[str, str] = field(default_factory=dict)
+    motion: "Motion | None" = None
 
     def meshes(self) -> dict[str, MeshLike]:
         """All meshes by name: ``source``, ``target``, ``output NAME`` for each method, ``truth`` if there is one."""
         given = {"source": self.source, "target": self.target}
         outputs = {output_of(name): mesh for name, mesh in self.outputs.items()}
         return {**given, **outputs, **({} if self.truth is None else {"truth": self.truth})}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A sequence: source and output of each frame, in the units and axes of the first, and frames a second."""
+
+    frames: Sequence[tuple[MeshLike, MeshLike]]
+    rate: float
 
 
 @dataclass(frozen=True)
@@ -131,6 +143,24 @@ def placed(comparison: Comparison) -> dict[str, Mesh]:
         name: Mesh(_stood(mesh, name, right, moves_with=meshes.get("truth")), mesh.faces)
         for name, mesh in meshes.items()
     }
+
+
+def placed_frames(comparison: Comparison) -> Iterator[tuple[Mesh, Mesh]]:
+    """Yield source and output of each frame, moved and scaled as :func:`placed` does with those of the first."""
+    if comparison.motion is None:
+        return
+    (output,) = comparison.outputs.values()
+    scale = _size(output.vertices) / max(_size(comparison.source.vertices), 1e-12)
+    starts = standing_point(comparison.source.vertices), standing_point(output.vertices)
+    for source, posed in comparison.motion.frames:
+        moved = scale * (source.vertices - starts[0]), posed.vertices - starts[1]
+        yield Mesh(moved[0], source.faces), Mesh(moved[1], posed.faces)
+
+
+def look_at(mesh: MeshLike) -> Look | None:
+    """Return what the faces of a mesh look like by themselves, where it says so."""
+    look = getattr(mesh, "look", None)
+    return look if isinstance(look, Look) else None
 
 
 def _stood(mesh: Mesh, name: str, right: Mesh | None, *, moves_with: Mesh | None) -> Floats:

@@ -7,6 +7,7 @@ import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,8 @@ from workflows.transfer.choice import chosen, standings
 from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
+    from training.viz.look import Look
+    from training.viz.transfer_example import Comparison
     from training.viz.transfer_picture import NamedMesh
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
@@ -49,6 +52,7 @@ class TransferWork:
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
         self._by = by
         self._shown: dict[int, Mesh] = {}
+        self._played: dict[int, Mesh] = {}
 
     @classmethod
     def of(
@@ -154,9 +158,10 @@ class TransferWork:
             warn(line)
 
     def _posed(self) -> Iterator[Mesh]:
-        """The output of every frame; those that the picture shows are kept."""
+        """The output of every frame; those that picture and page show are kept."""
         count = len(self.job.sources)
         kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
+        played = range(0, count, self._frames_apart) if self._is_played else range(0)
         frames = self.transfer.sequence(
             map(self._source, range(count)),
             self.target.mesh,
@@ -172,32 +177,85 @@ class TransferWork:
         for number, posed in enumerate(frames):
             if number in kept:
                 self._shown[number] = posed
+            if number in played:
+                self._played[number] = Mesh(posed.vertices.astype(np.float32), posed.faces)
             yield posed
+
+    @property
+    def _is_played(self) -> bool:
+        return self.job.viewer and self.job.is_sequence
+
+    @cached_property
+    def _frames_apart(self) -> int:
+        """The page of a sequence shows every so manieth frame; where that is not all, a line says so."""
+        from training.viz.viewer import MOTION_LIMIT, frames_apart
+
+        count = len(self.job.sources)
+        apart = frames_apart(count, len(self.first.vertices) + len(self.target.mesh.vertices))
+        if apart > 1:
+            warn(
+                f"{self.job.beside('.html')} plays one of {apart} frames: all {count:,} take more than "
+                f"{MOTION_LIMIT // 10**6} MB. Transfer a part of the sequence to see each"
+            )
+        return apart
 
     def _draw(self) -> None:
         from training.viz.transfer_picture import shown, write_page, write_picture
 
-        job = self.job
-        rows = [
-            shown(
-                _upright(self._source(number), self.axes[0], job.sources[number]),
-                _upright(self.target.mesh, self.axes[1], job.target),
-                _upright(posed, self.axes[1], job.frame_file(job.sources[number]) if job.is_sequence else job.out),
-            )
-            for number, posed in self._shown.items()
-        ]
+        job, target = self.job, self._upright_target(self.target.mesh, self.job.target)
+        if job.picture or not job.is_sequence:
+            rows = [
+                shown(self._upright_source(number), target, self._upright_target(posed, self._place(number)))
+                for number, posed in self._shown.items()
+            ]
         if job.picture:
             write_picture(rows, job.beside(".png"))
         if job.viewer:
-            write_page(rows, job.beside(".html"))
+            write_page([self._sequence(target)] if job.is_sequence else rows, job.beside(".html"))
+
+    def _place(self, number: int) -> Path:
+        return self.job.frame_file(self.job.sources[number]) if self.job.is_sequence else self.job.out
+
+    def _sequence(self, target: "NamedMesh") -> "Comparison":
+        """All frames that the page plays, as one transfer that moves."""
+        from training.viz.transfer_example import Motion
+        from training.viz.transfer_picture import shown
+
+        frames = [
+            (self._upright_source(number), self._upright_target(posed, self._place(number)))
+            for number, posed in self._played.items()
+        ]
+        motion = Motion(frames, self.job.fps / self._frames_apart)
+        count = len(self.job.sources)
+        title = f"{target.name} in the poses of {self.job.sources[0].parent.resolve().name} ({count:,} frames)"
+        return shown(frames[0][0], target, frames[0][1], motion=motion, title=title)
+
+    def _upright_source(self, number: int) -> "NamedMesh":
+        return _upright(self._source(number), self.axes[0], self.job.sources[number], self._source_look)
+
+    def _upright_target(self, mesh: Mesh, path: Path) -> "NamedMesh":
+        return _upright(mesh, self.axes[1], path, self._target_look)
+
+    @cached_property
+    def _source_look(self) -> "Look | None":
+        from training.viz.look import look_of
+
+        return look_of(self.job.read_source(0).content.surface)
+
+    @cached_property
+    def _target_look(self) -> "Look | None":
+        from training.viz.look import look_of
+
+        return look_of(self.target.content.surface)
 
 
-def _upright(mesh: Mesh, axes: Axes | Standing, path: Path) -> "NamedMesh":
+def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None") -> "NamedMesh":
     from training.viz.transfer_picture import (
         NamedMesh,  # it brings matplotlib, which a transfer does not need otherwise
     )
 
-    return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name)
+    fits = look is not None and look.fits(len(mesh.vertices), len(mesh.faces))
+    return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name, look if fits else None)
 
 
 def _move(path: Path, place: Path, *, is_own: bool) -> None:

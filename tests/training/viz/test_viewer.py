@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from tests.support.reports.pages import Elements
-from training.viz.transfer_example import Comparison, ErrorScale, placed
+from training.viz.look import Look, Paint
+from training.viz.transfer_example import Comparison, ErrorScale, Motion, placed
 from training.viz.transfer_picture import NamedMesh
-from training.viz.viewer import decode_positions, viewer_payload, write_viewer
+from training.viz.viewer import MOTION_LIMIT, decode_positions, frames_apart, viewer_payload, write_viewer
 
 
 def examples(count: int = 2, name: str = "body", methods: tuple[str, ...] = ("DSFFNet",)) -> list[Comparison]:
@@ -166,3 +167,63 @@ def test_nothing_to_show_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="1 of 50 vertices of the output DSFFNet are not finite"):
         write_viewer(broken, tmp_path / "viewer.html", title="t")
     assert not list(tmp_path.iterdir())
+
+
+def painted(mesh: NamedMesh) -> NamedMesh:
+    """The mesh with a texture on half of its faces, and a seam."""
+    texture = np.zeros((4, 8, 3), np.uint8)
+    uvs = np.zeros((len(mesh.faces), 3, 2))
+    uvs[::2] += 0.5
+    paints = (Paint((1.0, 1.0, 1.0), texture), Paint((0.0, 0.5, 0.0)))
+    return replace(mesh, look=Look(paints, np.arange(len(mesh.faces)) % 2, uvs, np.full((len(mesh.vertices), 3), 0.5)))
+
+
+def test_what_faces_look_like_is_kept_once_with_all_of_its_faces() -> None:
+    (example,) = examples(1)
+    target = painted(NamedMesh(example.target.vertices, example.target.faces, "t"))
+    output = replace(target, vertices=np.asarray(target.vertices) + 1)
+    payload = viewer_payload(
+        [replace(example, target=target, outputs={"m": output}, truth=None)], error_scale=ErrorScale()
+    )
+    (shown,) = payload["examples"]
+    assert shown["source"]["look"] is None and shown["target"]["look"] == shown["outputs"]["m"]["look"]
+    look = payload["looks"][shown["target"]["look"]]
+    of, faces = (np.frombuffer(base64.b64decode(look[name]), "<u4") for name in ("of", "faces"))
+    first = look["paints"][0]["faces"]
+    assert [paint["faces"] for paint in look["paints"]] == [40, 40]
+    order = np.argsort(np.arange(80) % 2, kind="stable")
+    assert np.array_equal(of[faces.reshape(-1, 3)], np.asarray(target.faces)[order])
+    uvs = np.frombuffer(base64.b64decode(look["uvs"]), "<f4").reshape(-1, 2)[faces.reshape(-1, 3)]
+    assert (uvs[:first] == 0.5).all() and (uvs[first:] == 0).all()
+    assert look["paints"][0]["texture"].startswith("data:image/jpeg;base64,") and look["paints"][1]["texture"] is None
+    assert set(base64.b64decode(look["colors"])) == {128}
+
+
+def test_a_sequence_is_whole_and_stays_where_it_begins() -> None:
+    (example,) = examples(1)
+    source, posed = example.source, example.outputs["DSFFNet"]
+    frames = [
+        (
+            NamedMesh(np.asarray(source.vertices) + step, source.faces, f"w{step}"),
+            NamedMesh(np.asarray(posed.vertices) * 2 + step, posed.faces, f"o{step}"),
+        )
+        for step in range(5)
+    ]
+    first = replace(example, source=frames[0][0], outputs={"m": frames[0][1]}, truth=None, motion=Motion(frames, 12.5))
+    (shown,) = viewer_payload([first], error_scale=ErrorScale())["examples"]
+    motion = shown["motion"]
+    assert motion["rate"] == 12.5 and [frame["name"] for frame in motion["output"]] == ["o0", "o1", "o2", "o3", "o4"]
+    stands = placed(first)
+    scale = np.ptp(stands["source"].vertices, axis=0).max() / np.ptp(source.vertices, axis=0).max()
+    for step, (one, other) in enumerate(zip(motion["source"], motion["output"], strict=True)):
+        assert np.allclose(decode_positions(one), stands["source"].vertices + scale * step, atol=1e-3)
+        assert np.allclose(decode_positions(other), stands["output m"].vertices + step, atol=1e-3)
+    still = viewer_payload([replace(first, motion=None)], error_scale=ErrorScale())["examples"][0]
+    assert still["motion"] is None and still["view"]["height"] < shown["view"]["height"], "all frames are in view"
+
+
+def test_a_long_sequence_is_thinned_to_a_page_of_bounded_size() -> None:
+    assert frames_apart(100, 2 * 6890) == 1 and frames_apart(1000, 2 * 6890) == 3
+    for count, vertices in ((10_000, 738), (2_000, 2 * 6890), (3, 10**7)):
+        kept = len(range(0, count, frames_apart(count, vertices)))
+        assert kept == 1 or kept * 8 * vertices <= MOTION_LIMIT

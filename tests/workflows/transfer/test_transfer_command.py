@@ -1,5 +1,6 @@
 """``dsffnet transfer`` as a person types it: what is written and said, and that a failure leaves nothing behind."""
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -18,9 +19,11 @@ from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from tests.support.commands import command, fails, process
 from tests.support.recipes import PARTS, tiny_dataset, tiny_training
+from tests.support.reports.pages import Elements
 from training.engine.trainer import train
 from training.inference.orientation import Axes
 from training.inference.transfer import PoseTransfer
+from training.viz import viewer
 from workflows.cli import main as cli
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
@@ -166,10 +169,15 @@ def test_a_picture_is_not_written_over_a_texture(transfer: Transfer, tmp_path: P
 def test_a_folder_becomes_a_folder_named_after_the_frames_and_one_animation(
     transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    transfer("walk", "person.obj", "-o", tmp_path / "out" / "walked", "--smooth", "5", "--picture")
+    transfer("walk", "person.obj", "-o", tmp_path / "out" / "walked", "--smooth", "5", "--picture", "--viewer")
     frames = sorted(f"frame_{number}.obj" for number in range(12))
     assert files(tmp_path / "out" / "walked") == ["animation.glb", *frames]
-    assert files(tmp_path / "out") == ["walked", "walked.png", *(f"walked/{n}" for n in ["animation.glb", *frames])]
+    assert files(tmp_path / "out") == [
+        "walked",
+        "walked.html",
+        "walked.png",
+        *(f"walked/{n}" for n in ["animation.glb", *frames]),
+    ]
     said = capsys.readouterr()
     assert "12 frames of person.obj" in said.out and "transfer" in said.err and "12/12" in said.err
 
@@ -195,6 +203,26 @@ def test_frames_take_the_place_of_earlier_ones_but_not_of_other_files(
 def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path) -> None:
     transfer("walk/frame_*.ply", "person.obj", "-o", tmp_path / "walked.glb")
     assert files(tmp_path) == ["walked.glb"]
+
+
+@pytest.mark.parametrize(("limit", "shown"), [(None, range(12)), (25_000, range(0, 12, 4))])
+def test_the_page_of_a_sequence_plays_its_frames_or_says_how_many(
+    transfer: Transfer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    limit: int | None,
+    shown: range,
+) -> None:
+    if limit:
+        monkeypatch.setattr(viewer, "MOTION_LIMIT", limit)
+    transfer("walk", "person.obj", "-o", tmp_path / "walked.glb", "--viewer", "--fps", "24")
+    data = json.loads(Elements((tmp_path / "walked.html").read_text()).texts["data"])
+    (example,) = data["examples"]
+    assert [frame["name"] for frame in example["motion"]["source"]] == [f"frame_{number}.ply" for number in shown]
+    assert len(example["motion"]["output"]) == len(shown) and example["motion"]["rate"] == 24 * len(shown) / 12
+    assert example["title"] == "person.obj in the poses of walk (12 frames)"
+    assert ("plays one of 4 frames: all 12" in capsys.readouterr().err) == bool(limit)
 
 
 def test_frames_come_in_their_numbers_order(transfer: Transfer, run: Path, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@
 import { DirectionalLight, HemisphereLight, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { data, find } from "./viewer.data.js";
-import { bytes, clear, decode, errorColors, ground, roleColors, shaded, surface } from "./viewer.meshes.js";
+import { bytes, clear, decode, discard, errorColors, ground, move, roleColors, shaded, surface } from "./viewer.meshes.js";
 import { build, fit, make } from "./viewer.tiles.js";
 
 let renderer;
@@ -22,17 +22,23 @@ function content(panel, example) {
   }
   const mesh = panel.kind === "output" ? example.outputs[panel.method] : example[panel.kind];
   const words = panel.kind === "output" && data.methods.length > 1 ? example.metrics[panel.method] : mesh?.name;
-  return mesh && { mesh, words, strength: 0.8, colors: roleColors(data.colors[panel.kind], bytes(mesh.openness).length) };
+  const look = find("look").checked ? mesh?.look : null;
+  const color = look ? [1, 1, 1] : data.colors[panel.kind];
+  return mesh && { mesh, words, look, strength: 0.8, colors: roleColors(color, bytes(mesh.openness).length) };
 }
 
 function errorValues(error) {
   return Float32Array.from(decode(error.levels, "uint16"), (level) => level * error.step);
 }
 
+function bodyOf(shown, mesh = shown.mesh) {
+  return surface(mesh, shaded(shown.colors, decode(shown.mesh.openness, "uint8"), shown.strength), shown.look);
+}
+
 function refill(panel, example) {
   const shown = content(panel, example);
   clear(panel.scene);
-  if (shown) panel.scene.add(surface(shown.mesh, shaded(shown.colors, decode(shown.mesh.openness, "uint8"), shown.strength)), ground(shown.mesh));
+  if (shown) panel.scene.add(bodyOf(shown), ground(shown.mesh));
   panel.element.querySelector(".name").textContent = shown ? shown.words : "none";
   panel.element.classList.toggle("best", panel.kind === "output" && panel.method === example.best);
 }
@@ -52,7 +58,51 @@ function show(index) {
   find("metrics").textContent = data.methods.length === 1 ? example.metrics[data.methods[0].name] ?? "" : "";
   find("choice").value = find("slider").value = String(current);
   find("count").textContent = `${current + 1} / ${data.examples.length}`;
+  find("player").hidden = !example.motion || !renderer;
+  if (example.motion) {
+    find("frame").max = String(example.motion.output.length - 1);
+    toFrame(Math.min(Number(find("frame").value), example.motion.output.length - 1));
+  }
   redraw();
+}
+
+// A frame of the sequence in the panels that move; a mesh of other triangles takes the place of the one before.
+function toFrame(number) {
+  const example = data.examples[current];
+  const { motion } = example;
+  for (const panel of panels.filter(({ kind }) => motion[kind])) {
+    const mesh = motion[panel.kind][number];
+    const body = panel.scene.getObjectByName("body");
+    if (!move(body, mesh)) {
+      discard(panel.scene, body);
+      const shown = content(panel, example); // the first frame, whose light and colours hold for its triangles alone
+      const count = decode(mesh.positions, "uint16").length / 3;
+      panel.scene.add(shown.mesh.faces === mesh.faces ? bodyOf(shown, mesh) : surface(mesh, roleColors(data.colors[panel.kind], count)));
+    }
+    panel.element.querySelector(".name").textContent = mesh.name;
+    discard(panel.scene, panel.scene.getObjectByName("ground"));
+    panel.scene.add(ground(mesh));
+  }
+  find("frame").value = String(number);
+  find("time").textContent = `${number + 1} / ${motion.output.length}`;
+  redraw();
+}
+
+let playing = null; // when the first frame was, in milliseconds
+
+function play(wanted) {
+  const { motion } = data.examples[current];
+  playing = wanted && motion && renderer ? performance.now() - (1000 * Number(find("frame").value)) / motion.rate : null;
+  find("play").textContent = playing === null ? "play" : "pause";
+  if (playing !== null) requestAnimationFrame(tick);
+}
+
+function tick(now) {
+  const { motion } = data.examples[current];
+  if (playing === null || !motion) return;
+  const number = Math.floor((Math.max(now - playing, 0) * motion.rate) / 1000) % motion.output.length;
+  if (String(number) !== find("frame").value) toFrame(number);
+  requestAnimationFrame(tick);
 }
 
 // Mean errors of an example as bars, shortest best; all examples share one scale.
@@ -184,6 +234,13 @@ function listen() {
     panels.forEach((panel) => { const wire = panel.scene.getObjectByName("wireframe"); if (wire) wire.visible = event.target.checked; });
     redraw();
   });
+  find("look").addEventListener("change", () => show(current));
+  find("play").addEventListener("click", () => play(playing === null));
+  find("frame").addEventListener("input", (event) => {
+    play(false);
+    toFrame(Number(event.target.value));
+  });
+  window.addEventListener("painted", redraw);
   document.addEventListener("keydown", (event) => {
     if (["INPUT", "SELECT"].includes(event.target.tagName) && event.target.type !== "checkbox") return;
     if (event.key === "ArrowLeft") show(current - 1);
@@ -206,6 +263,7 @@ function fill() {
   }));
   find("unit").textContent = `per-vertex error (${data.error.unit})`;
   for (const element of document.querySelectorAll(".single")) element.hidden = data.examples.length < 2;
+  find("look").parentElement.hidden = !Object.keys(data.looks).length;
 }
 
 function start() {
@@ -227,7 +285,8 @@ function start() {
   listen();
   show(0);
   resize();
-  window.viewer = { panels, show }; // for tests and for the curious
+  play(true);
+  window.viewer = { panels, show, toFrame, play }; // for tests and for the curious
 }
 
 start();

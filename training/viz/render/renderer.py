@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from datagen.common.arrays import Floats, Integers
 from datagen.mesh.geometry import Mesh
+from training.viz.look import Look
 from training.viz.render.camera import Camera, MeshLike, checked_vertices, frame
 from training.viz.render.lighting import ground_shade, ground_shadow, lighting, openness, vertex_normals
 from training.viz.render.rasterizer import on_plane, planes, rasterise
@@ -34,6 +35,7 @@ def render_mesh(
     faces: Integers,
     *,
     colors: npt.ArrayLike | None = None,
+    look: Look | None = None,
     camera: Camera | None = None,
     size: tuple[int, int] = (320, 400),
     background: tuple[float, float, float] = BACKGROUND,
@@ -49,6 +51,8 @@ def render_mesh(
         Triangles; drawn from both sides.
     colors : array [v, 3] or [3], optional
         sRGB in 0..1, one a vertex or one for all; clay grey by default.
+    look : Look, optional
+        What the faces look like by themselves, in the place of ``colors``.
     camera : Camera, optional
         The view; by default `frame` of this mesh alone.
     size : (int, int)
@@ -76,8 +80,11 @@ def render_mesh(
     vertices, faces = checked_vertices(vertices), _checked_faces(faces, len(vertices))
     camera = camera or frame([Mesh(vertices, faces)], size=size)
     normals = vertex_normals(vertices, faces)
+    if look is not None:
+        colors = (1.0, 1.0, 1.0) if look.colors is None else look.colors
     albedo = _linear(_checked_colors(CLAY if colors is None else colors, len(vertices)))
-    light = _supersampled(camera, size, vertices, faces, np.c_[normals, openness(vertices, faces), albedo], shading)
+    attributes = np.c_[normals, openness(vertices, faces), albedo]
+    light = _supersampled(camera, size, vertices, faces, attributes, shading, look)
     mesh_light, coverage = light[..., :3], light[..., 3:]
     scenery = _linear(np.array(background)) * (1 - shading * ground_shade(camera, size, vertices, faces))[..., None]
     picture = _display(mesh_light + (1 - coverage) * scenery)
@@ -109,7 +116,13 @@ def _display(light: Floats) -> Floats:
 
 
 def _supersampled(
-    camera: Camera, size: tuple[int, int], vertices: Floats, faces: Integers, attributes: Floats, shading: float
+    camera: Camera,
+    size: tuple[int, int],
+    vertices: Floats,
+    faces: Integers,
+    attributes: Floats,
+    shading: float,
+    look: Look | None,
 ) -> Floats:
     """Return linear light times coverage, and coverage [h, w, 4]; attributes: normal, openness, albedo [v, 7]."""
     width, height = size[0] * _SUPERSAMPLE, size[1] * _SUPERSAMPLE
@@ -120,7 +133,8 @@ def _supersampled(
     screen = np.stack(
         [width / 2 + focal * in_view[:, 0] / away, height / 2 - focal * in_view[:, 1] / away, 1 / away], 1
     )
-    ahead = faces[(-in_view[faces, 2] > 1e-6).all(1)]
+    kept = np.flatnonzero((-in_view[faces, 2] > 1e-6).all(1))
+    ahead = faces[kept]
     owner, _ = rasterise(screen, ahead, width, height)
     pixels = np.flatnonzero(owner >= 0)
     owner = owner[pixels]
@@ -132,7 +146,8 @@ def _supersampled(
     # y points down, so a face seen from its front has negative area; one seen from behind is lit as if turned.
     normals = surface[:, :3] * np.where(facing[owner] < 0, 1, -1)[:, None]
     diffuse, gloss = lighting(normals, surface[:, 3], axes)
-    lit = surface[:, 4:] * (1 + shading * (diffuse - 1))[:, None] + shading * gloss[:, None]
+    paint = 1.0 if look is None else look.painted(kept[owner], weights)
+    lit = paint * surface[:, 4:] * (1 + shading * (diffuse - 1))[:, None] + shading * gloss[:, None]
     target = pixels // width // _SUPERSAMPLE * size[0] + pixels % width // _SUPERSAMPLE
     layers = [np.bincount(target, layer, size[0] * size[1]) for layer in (*lit.T, np.ones(len(lit)))]
     return np.stack(layers, -1).reshape(size[1], size[0], 4) / _SUPERSAMPLE**2
