@@ -1,6 +1,7 @@
 """What the faces of a mesh look like in its file: colours of vertices, materials and their textures."""
 
 import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from datagen.mesh.formats.surface import Image, Material, Surface, numbered
 
 _LARGEST = 1024  # pixels of a texture's side, as it is drawn
 _MOST_PIXELS = 2**26  # of one that is read at all
+_MOST_TEXTURES = 64  # of a mesh; the others leave base colours
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
 _SEEN = 0.02  # difference of colours by which materials are told from grey, and from each other
 
 
@@ -79,7 +82,7 @@ def look_of(surface: Surface) -> Look | None:
 
     Transparency is not drawn. A texture that cannot be read leaves the base colour.
     """
-    paints = tuple(_paint(material) for material in surface.materials)
+    paints = tuple(_paints(surface.materials))
     if surface.colours is None and not _is_seen(paints):
         return None
     faces = len(surface.polygon_of_face)
@@ -100,14 +103,19 @@ def _is_seen(paints: tuple[Paint, ...]) -> bool:
     return bool(differs) or any(paint.texture is not None for paint in paints)
 
 
-def _paint(material: Material) -> Paint:
-    red, green, blue, _ = material.colour
-    return Paint((red, green, blue), _texture(material.image) if material.image else None)
+def _paints(materials: Sequence[Material]) -> Iterator[Paint]:
+    """Paints of materials; a texture that several share is read once."""
+    known: dict[bytes, npt.NDArray[np.uint8] | None] = {}
+    for material in materials:
+        red, green, blue, _ = material.colour
+        if material.image and material.image.content not in known:
+            known[material.image.content] = _texture(material.image) if len(known) < _MOST_TEXTURES else None
+        yield Paint((red, green, blue), known[material.image.content] if material.image else None)
 
 
 def _texture(image: Image) -> npt.NDArray[np.uint8] | None:
     try:
-        with Pillow.open(io.BytesIO(image.content)) as opened:
+        with Pillow.open(io.BytesIO(image.content), formats=_FORMATS) as opened:
             if opened.width * opened.height > _MOST_PIXELS:
                 return None
             opened.draft("RGB", (_LARGEST, _LARGEST))

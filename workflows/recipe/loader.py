@@ -170,7 +170,7 @@ def describe_fields(
             its = value if isinstance(value, section) else None
             yield from describe_fields(section, f"{prefix}{name}.", recipe=its)
         if not sections:
-            default = value if recipe else field.get_default(call_default_factory=True)
+            default: Any = value if recipe else field.get_default(call_default_factory=True)
             default = f"a training of {default.network.name!r}" if isinstance(default, TrainingRecipe) else default
             shown = (
                 [part.model_dump() for part in default]

@@ -11,6 +11,7 @@ from datagen.mesh.geometry import Mesh
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.inference.domain_check import Seen, noted, part_sizes, remarks, seen_by
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation
+from training.inference.standing import Standing
 from workflows.pipeline.train import write_head
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 2, 15), [0.0, 0.4], indexing="ij"), -1).reshape(-1, 3)
@@ -120,3 +121,15 @@ def test_a_training_notes_its_bodies_such_that_none_of_them_is_warned_of(tmp_pat
         for vertices in dataset.vertices(who, dataset.grid.poses_of(who)):
             shape = np.ptp(vertices, axis=0) / np.ptp(vertices, axis=0).max()
             assert (seen.least <= shape + 1e-6).all() and (shape <= seen.most + 1e-6).all()
+
+
+@pytest.mark.parametrize(("misfit", "is_said"), [(0.001, False), (0.5, True)])
+def test_parts_that_do_not_touch_are_no_matter_where_the_whole_is_understood(misfit: float, is_said: bool) -> None:
+    """Clothes, hair and eyes are geometries of their own; three people are no body that a network understands."""
+    several = Mesh(
+        np.concatenate([GRID + 3 * number for number in range(3)]),
+        np.concatenate([STRIP + len(GRID) * number for number in range(3)]),
+    )
+    standing = Standing(np.eye(3), misfit)
+    said = list(remarks(several, name="A", axes=standing, way=None, both=None, stated=False, seen=None))
+    assert any("separate parts" in line and "--target-geometry" in line for line in said) == is_said

@@ -60,6 +60,14 @@ def test_a_texture_that_cannot_be_read_leaves_the_base_colour() -> None:
         assert np.abs(drawn(surface) - GREEN).max() <= 3
 
 
+def test_a_texture_that_materials_share_is_read_once_and_too_large_ones_never() -> None:
+    shared = png(np.full((4, 4, 3), 255))
+    materials = tuple(Material(str(number), (1, 1, 1, 1), shared) for number in range(3))
+    look = look_of(replace(SQUARE, material_of=np.array([1]), materials=materials))
+    assert look is not None and len({id(paint.texture) for paint in look.paints[:3]}) == 1
+    assert look_of(textured(png(np.zeros((9000, 9000), np.uint8), "1"))) is None
+
+
 def test_a_file_that_says_nothing_of_colours_has_no_look() -> None:
     grey = Material("default", (0.8, 0.8, 0.8, 1.0))
     assert look_of(SQUARE) is None and look_of(replace(SQUARE, material_of=np.array([0]), materials=(grey,))) is None
