@@ -21,7 +21,7 @@ WORKDIR /app
 ARG TORCH_INDEX=""
 COPY pyproject.toml constraints.txt LICENSE README.md ./
 COPY deploy/requirements.txt deploy/
-RUN mkdir datagen training workflows && touch datagen/__init__.py training/__init__.py workflows/__init__.py \
+RUN mkdir datagen dsffnet training workflows && touch datagen/__init__.py dsffnet/__init__.py training/__init__.py workflows/__init__.py \
     && pip install --constraint constraints.txt ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} \
         --requirement deploy/requirements.txt --editable ".[s3]"
 

@@ -12,7 +12,7 @@ from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from tests.support.commands import ROOT
 
-PACKAGES = ("datagen", "training", "workflows")
+PACKAGES = ("datagen", "dsffnet", "training", "workflows")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 
 
@@ -33,8 +33,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def dsffnet(site: Path, *words: object) -> str:
-    """What a command of the installed wheel prints, in a folder from which no source can be imported."""
+    """What a command of the installed wheel prints."""
     code = "import workflows; print(workflows.__file__); from workflows.cli.main import main; main()"
+    place, _, said = python(site, code, *words).partition("\n")
+    assert Path(place).is_relative_to(site)
+    return said
+
+
+def python(site: Path, code: str, *words: object) -> str:
+    """What a program prints that imports the installed wheel, in a folder from which no source can be imported."""
     done = subprocess.run(
         [sys.executable, "-c", code, *map(str, words)],
         cwd=site.parent,
@@ -43,9 +50,8 @@ def dsffnet(site: Path, *words: object) -> str:
         text=True,
         check=False,
     )
-    place, _, said = done.stdout.partition("\n")
-    assert done.returncode == 0 and Path(place).is_relative_to(site), done.stderr
-    return said
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_everything_that_is_read_is_in_it(site: Path) -> None:
@@ -64,3 +70,7 @@ def test_two_meshes_with_the_weights_that_come_with_the_project(site: Path, tmp_
     save_mesh(Mesh(vertices, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), tmp_path / "a.obj")
     dsffnet(site, "transfer", tmp_path / "a.obj", tmp_path / "a.obj", "-o", tmp_path / "b.obj")
     assert load_mesh(tmp_path / "b.obj").vertices.shape == (4, 3)
+    code = "import sys, dsffnet; dsffnet.transfer(*sys.argv[1:3]).export(sys.argv[3]); print(dsffnet.__file__)"
+    said = python(site, code, *(tmp_path / name for name in ("a.obj", "a.obj", "c.obj")))
+    assert Path(said.strip()).is_relative_to(site)
+    assert (tmp_path / "c.obj").read_bytes() == (tmp_path / "b.obj").read_bytes()

@@ -23,7 +23,7 @@ from tests.fuzz.targets import FAMILIES, Target
 from tests.fuzz.watch import CPU_SECONDS, MEMORY, OutOfTime, Trespass, Watch, snapshot, watched
 
 _ROOT = Path(__file__).parents[2]
-_PACKAGES = tuple(str(_ROOT / name) + os.sep for name in ("datagen", "training", "workflows"))
+_PACKAGES = tuple(str(_ROOT / name) + os.sep for name in ("datagen", "dsffnet", "training", "workflows"))
 _LONGEST_LINE = 2000
 _ALLOCATION = re.compile(r"MemoryError|[Uu]nable to allocate|can.t allocate|Cannot allocate")
 

@@ -31,7 +31,7 @@ def test_the_search_finds_them() -> None:
     assert not list(texts_of_no_encoding(fine))
 
 
-@pytest.mark.parametrize("package", ["datagen", "training", "workflows"])
+@pytest.mark.parametrize("package", ["datagen", "dsffnet", "training", "workflows"])
 def test_every_file_of_text_names_its_encoding(package: str) -> None:
     found = {
         f"{path.relative_to(ROOT)}:{line}"

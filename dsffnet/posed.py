@@ -1,0 +1,130 @@
+"""Meshes of any kind -> a job of ``dsffnet transfer`` -> a posed mesh that can be written as the target's file."""
+
+import argparse
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.common.errors import MeshError, RecipeError
+from datagen.mesh.files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh.formats.surface import Alone, Encoded, Surface
+from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
+from training.inference.orientation import axes_of_both
+from training.inference.transfer import REFINE_WEIGHT
+from workflows.cli.transfer import weights_of
+from workflows.transfer.job import TransferJob
+from workflows.transfer.run import TransferWork, warn
+
+
+@dataclass(frozen=True)
+class PosedMesh:
+    """The target's faces [f, 3], and its vertices [n, 3] float64 in the source's pose."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    job: TransferJob = field(repr=False)
+    target: MeshFile = field(repr=False)
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """Write a mesh file; the suffix tells the format, and what the target's file has beside positions stays.
+
+        Raises
+        ------
+        DsffnetError
+            The place is one of the meshes that were read, of an unknown format, or cannot be written.
+        """
+        job = replace(self.job, out=Path(path))
+        job.check_places()
+        for line in write_posed(self.target, self.vertices, job.out):
+            warn(line)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What :func:`dsffnet.transfer` is asked for beside the meshes."""
+
+    model: str | os.PathLike[str] | None = None
+    refine: bool = False
+    align: bool = False
+    up: str | None = None
+    front: str | None = None
+    force: bool = False
+
+    @property
+    def weights(self) -> argparse.Namespace:
+        """The options by which the command finds its weights."""
+        model = None if self.model is None else os.fspath(self.model)
+        return argparse.Namespace(model=model, checkpoint="result", force=self.force, tracking_uri=None)
+
+
+def posed(source: Any, target: Any, options: Options) -> PosedMesh:
+    """Return the target in the pose of the source, by the work of ``dsffnet transfer``."""
+    read = [_mesh_file(given, role) for given, role in ((source, "source"), (target, "target"))]
+    job = _job(read, options)
+    with weights_of(options.weights) as weights:
+        work = TransferWork.of(job, weights, first=read[0].mesh, target=read[1], force=options.force)
+        found = work.transfer(
+            source=read[0].mesh,
+            target=read[1].mesh,
+            source_axes=work.axes[0],
+            target_axes=work.axes[1],
+            refine=REFINE_WEIGHT if options.refine else 0.0,
+        )
+    return PosedMesh(np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64), job, read[1])
+
+
+def _job(read: list[MeshFile], options: Options) -> TransferJob:
+    if options.align and (options.up or options.front):
+        raise RecipeError("align finds how the meshes stand; leave it out to say it by up and front")
+    return TransferJob(
+        sources=[read[0].path],
+        target=read[1].path,
+        out=Path(),
+        is_sequence=False,
+        axes=None if options.align else axes_of_both(options.up or "Y", options.front or "Z"),
+        is_told=bool(options.up or options.front),
+        refine=options.refine,
+    )
+
+
+def _mesh_file(given: Any, role: str) -> MeshFile:
+    """A mesh as a file that was read: from its path, or from vertices and triangles in memory."""
+    if isinstance(given, str | os.PathLike):
+        return read_mesh_file(Path(given))
+    mesh = check_mesh(_mesh(given, role), name=role)
+    if len(mesh.vertices) > VERTEX_LIMIT:
+        raise MeshError(f"{role} has {len(mesh.vertices):,} vertices, more than {VERTEX_LIMIT:,}: decimate it")
+    require_thickness(mesh.vertices.astype(np.float64), Path(role))
+    return MeshFile(Path(role), role, mesh, _InMemory(mesh))
+
+
+def _mesh(given: Any, role: str) -> Mesh:
+    try:
+        vertices, faces = (given.vertices, given.faces) if hasattr(given, "vertices") else given
+        return Mesh(np.array(vertices, np.float64), np.array(faces, np.int64))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise MeshError(
+            f"{role} is a {type(given).__name__}; give a path, an object with vertices [n, 3] and faces [f, 3], or a "
+            f"pair of these ({error})"
+        ) from error
+
+
+class _InMemory(Alone):
+    """Vertices and triangles that lie in no file, so that every format is made anew."""
+
+    name = None
+    only_here: list[str]
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.vertices = np.asarray(mesh.vertices, np.float64)
+        self.surface = Surface(mesh.faces.ravel().astype(np.int64), np.full(len(mesh.faces), 3))
+        self.only_here = []
+
+    def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
+        """Never asked for: there is no file to write again."""
+        raise NotImplementedError

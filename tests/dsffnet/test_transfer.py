@@ -1,0 +1,82 @@
+"""``dsffnet.transfer``: what the command writes, from paths, trimesh objects and arrays; light to import."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.geometry import Mesh
+from datagen.store import open_dataset
+from dsffnet import DsffnetError, transfer
+from tests.support.commands import ROOT
+from tests.support.recipes import tiny_training
+from training.engine.trainer import train
+from workflows.cli import main as cli
+
+
+@pytest.fixture(scope="module")
+def run(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny run, and in its folder pose.ply and person.ply."""
+    folder, dataset = tmp_path_factory.mktemp("api"), open_dataset(str(_pristine))
+    train(tiny_training(), data=dataset.url, run=folder / "run")
+    for name, identity, pose in (("pose", 3, 7), ("person", 4, 0)):
+        save_mesh(Mesh(dataset.vertices(identity, pose), dataset.faces(identity)), folder / f"{name}.ply")
+    return folder / "run"
+
+
+@pytest.mark.parametrize("options", [{}, {"refine": True}, {"align": True}, {"up": "Z", "front": "-Y"}])
+def test_the_bits_of_the_command(run: Path, tmp_path: Path, options: dict[str, str | bool]) -> None:
+    pose, person = run.parent / "pose.ply", run.parent / "person.ply"
+    words = [f"--{key}" if value is True else f"--{key}={value}" for key, value in options.items()]
+    given = cli.parsed(["transfer", str(pose), str(person), "-o", str(tmp_path / "a.ply"), "--model", str(run), *words])
+    given.command(given)
+    transfer(pose, person, model=run, **options).export(tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_paths_objects_and_arrays_are_alike(run: Path, tmp_path: Path) -> None:
+    pose, person = (load_mesh(run.parent / f"{name}.ply") for name in ("pose", "person"))
+    body = trimesh.Trimesh(person.vertices, person.faces, process=False)
+    before = body.vertices.copy()
+    by_path = transfer(run.parent / "pose.ply", run.parent / "person.ply", model=run)
+    by_value = transfer((pose.vertices.tolist(), pose.faces), body, model=str(run))
+    assert np.array_equal(by_path.vertices, by_value.vertices) and np.array_equal(by_path.faces, by_value.faces)
+    assert np.array_equal(body.vertices, before) and not np.allclose(by_value.vertices, before, atol=1e-3)
+    for name in ("posed.obj", "posed.ply", "posed.glb", "posed.off", "posed.stl"):
+        by_value.export(tmp_path / name)
+        assert len(load_mesh(tmp_path / name).faces) == len(person.faces)
+    assert np.allclose(load_mesh(tmp_path / "posed.obj").vertices, by_path.vertices, atol=1e-6)
+
+
+def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
+    pose, good = run.parent / "pose.ply", load_mesh(run.parent / "person.ply")
+    flat = good.vertices * [1, 1, 0]
+    wrong = [
+        (good.vertices, "target is a ndarray; give a path, an object with vertices"),
+        ((good.vertices, [[0, 1, 10**6]]), "target: faces name vertex 1000000, but there are"),
+        ((good.vertices * np.nan, good.faces), "target: .* vertices are not finite"),
+        ((flat, good.faces), "target is flat: it has no thickness along z"),
+        (tmp_path / "no.obj", "no.obj"),
+        (7, "target is a int"),
+    ]
+    for given, said in wrong:
+        with pytest.raises(DsffnetError, match=said) as error:
+            transfer(pose, given, model=run)
+        assert "\n" not in str(error.value)
+    with pytest.raises(DsffnetError, match="no such run or weights"):
+        transfer(pose, pose, model=tmp_path / "no-run")
+    with pytest.raises(DsffnetError, match="align finds how the meshes stand"):
+        transfer(pose, pose, model=run, align=True, up="Z")
+    with pytest.raises(DsffnetError, match="never written over"):
+        transfer(pose, pose, model=run).export(pose)
+
+
+def test_importing_it_brings_no_heavy_package() -> None:
+    heavy = {"torch", "numpy", "trimesh", "mlflow", "ray", "zarr"}
+    code = f"import sys, dsffnet; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
