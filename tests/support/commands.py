@@ -43,6 +43,20 @@ def process(*arguments: object, folder: Path = ROOT, **environment: str) -> Done
     )
 
 
+def example(name: str, *arguments: object, folder: Path) -> str:
+    """What a script of examples/ prints, run in a folder."""
+    done = subprocess.run(
+        [sys.executable, ROOT / "examples" / name, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def fails(result: Done, status: int, *says: str) -> None:
     """One line on standard error that begins with ``error:``, the status, and no traceback."""
     assert result.returncode == status, result.stderr
