@@ -37,7 +37,7 @@ def test_both_are_trained_and_measured_on_the_same_triples(tmp_path: Path, capsy
     assert beside is not None and (beside.name, beside.model) == ("train-beside", f"{MODEL}-beside")
     assert whole.dataset == beside.dataset is not None, "MLflow shows it with the whole, too"
     pmd = whole.metrics["NPT/pmd_unseen"]
-    assert "**NPT**, step 2 " in beside.model_about and f"{pmd:.2f}e-4 in unseen poses" in beside.model_about
+    assert "NPT, step 2 " in beside.model_about and f"{pmd:.2f}e-4 in unseen poses" in beside.model_about
     report = folder.report.read_text()
     assert "Model card: NPT" in report and f"models:/{MODEL}-beside@" in report and "Beside it, NPT" in report
     capsys.readouterr()

@@ -106,7 +106,7 @@ def about_model(network: NetworkRecipe, step: int, dataset: Dataset, pmd: Mappin
     name = plain(PurePosixPath(dataset.url).name)
     scores = ", ".join(f"{value * 1e4:.2f}e-4 in {pose_type} poses" for pose_type, value in pmd.items())
     return (
-        f"**{plain(paper.method_name(network))}**, step {step:,} of a training on {name}: {dataset.recipe.body.family} "
+        f"{plain(paper.method_name(network))}, step {step:,} of a training on {name}: {dataset.recipe.body.family} "
         f"bodies, {people:,} identities in {poses:,} poses ({dataset.uuid}).\n\n"
         f"PMD of new identities: {scores or 'not measured'}."
     )
