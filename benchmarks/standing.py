@@ -21,8 +21,7 @@ from datagen.bodies import load_body
 from datagen.characters.cc0_animals import animal_files
 from datagen.mesh.files import read_mesh_file
 from datagen.poses import draw_poses
-from datagen.recipe import PoseRecipe
-from datagen.recipe.bodies import AnnyBody, AnnyTopology, PhenotypeRanges
+from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation, orientation
 from training.inference.transfer import PoseTransfer
 

@@ -6,7 +6,7 @@ in :mod:`datagen.recipe`, and one line in ``FAMILIES``. The contract tests then 
 
 from functools import lru_cache
 from importlib import import_module
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,15 @@ class BodyModel(Protocol):
         ...
 
 
+@runtime_checkable
+class DressedModel(Protocol):
+    """A body some of whose vertices are garments."""
+
+    def part_labels(self, parameters: NDArray[np.float64]) -> NDArray[np.int32] | None:
+        """What each vertex [vertex] belongs to: 0 skin, from 1 on garments; None for an identity without labels."""
+        ...
+
+
 FAMILIES = {
     "anny": "datagen.bodies.anny.model:AnnyModel",
     "smpl": "datagen.bodies.smpl_family.smpl:SmplModel",
@@ -52,6 +61,7 @@ FAMILIES = {
     "rigged": "datagen.bodies.rigged:RiggedModel",
     "imported": "datagen.bodies.imported:ImportedModel",
     "mixed": "datagen.bodies.mixed:MixedModel",
+    "clothed": "datagen.bodies.clothed.model:ClothedModel",
     "leg": "datagen.bodies.leg:LegModel",
 }
 
@@ -62,6 +72,11 @@ def load_body(recipe: Body) -> BodyModel:
     module, name = FAMILIES[recipe.family].split(":")
     model: BodyModel = getattr(import_module(module), name)(recipe)
     return model
+
+
+def part_labels(body: BodyModel, parameters: NDArray[np.float64]) -> NDArray[np.int32] | None:
+    """What each vertex [vertex] of an identity belongs to: 0 skin, from 1 on garments; None where nobody is dressed."""
+    return body.part_labels(parameters) if isinstance(body, DressedModel) else None
 
 
 def require_joints(body: BodyModel, source: PoseSource, *, family: str) -> None:

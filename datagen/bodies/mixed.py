@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies import BodyModel, load_body
+from datagen.bodies import BodyModel, load_body, part_labels
 from datagen.common.assets import Asset
 from datagen.mesh.rig import Rig
 from datagen.poses import Poses
@@ -56,6 +56,11 @@ class MixedModel:
         """The rig of that identity's body, None where it has none: bodies of one dataset may have different parts."""
         body, own = self._of(parameters)
         return body.rig(own, joints)
+
+    def part_labels(self, parameters: NDArray[np.float64]) -> NDArray[np.int32] | None:
+        """What each vertex [vertex] belongs to where that identity's body is dressed, None elsewhere."""
+        body, own = self._of(parameters)
+        return part_labels(body, own)
 
     def _of(self, parameters: NDArray[np.float64]) -> tuple[BodyModel, NDArray[np.float64]]:
         number = int(parameters[0])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies import BodyModel, load_body, require_joints
+from datagen.bodies import BodyModel, load_body, part_labels, require_joints
 from datagen.common.seeding import Stream, generator
 from datagen.generate.rigs import RigTable
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
@@ -23,7 +23,7 @@ READS_FOLDERS = ("imported", "mixed")
 _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
 _CONTENT = 2
 """The version of what a recipe means, part of the uuid: formats 2 and 3 hold the same meshes."""
-_PACKAGES = ("anny", "smplx", "numpy", "scipy", "zarr", "numcodecs")
+_PACKAGES = ("anny", "smplx", "numpy", "scipy", "warp-lang", "zarr", "numcodecs")
 
 
 def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
@@ -46,10 +46,11 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
     parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
     topologies = _Topologies(recipe, body)
     numbers = [topologies.number_of(identity, its) for identity, its in enumerate(parameters)]
+    labelled = {"labelled": list(topologies.labels)} if topologies.labels else {}
     table = RigTable()
     rig_numbers = [table.add(body.rig(its, source.joints)) for its in parameters]
     return Plan(
-        attributes={**_attributes(recipe, body, source), "rigs": table.parts},
+        attributes={**_attributes(recipe, body, source), "rigs": table.parts, **labelled},
         provenance={
             "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
             "git_commit": _git_commit(),
@@ -57,6 +58,7 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
         arrays=GridArrays(grid, numbers, topologies.vertices),
         parameters=np.stack(parameters),
         faces=topologies.faces,
+        labels=topologies.labels,
         poses=poses,
         triples=evaluation_lists(grid),
         rigs=table.rigs,
@@ -73,6 +75,7 @@ class _Topologies:
     def __init__(self, recipe: DatasetRecipe, body: BodyModel) -> None:
         self.faces: list[NDArray[np.int32]] = []
         self.vertices: list[int] = []
+        self.labels: dict[int, NDArray[np.int32]] = {}
         self._recipe, self._body, self._grid = recipe, body, Grid(recipe)
         self._numbers: dict[bytes, int] = {}
 
@@ -83,6 +86,8 @@ class _Topologies:
         if number == len(self.faces):
             one_pose = draw_poses(self._recipe.poses, self._grid.poses_of(identity)[:1])
             self.faces.append(faces)
+            if (labels := part_labels(self._body, parameters)) is not None:
+                self.labels[number] = labels
             self.vertices.append(self._body.vertices(parameters, one_pose).shape[1])
         return number
 

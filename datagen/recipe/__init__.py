@@ -1,21 +1,19 @@
 """The typed recipe of a dataset: its body, its poses, its sizes."""
 
+from datagen.recipe.anny import AnnyBody, AnnyRig, AnnyTopology, PhenotypeRanges
 from datagen.recipe.base import Frozen, Range
 from datagen.recipe.bodies import (
-    AnnyBody,
-    AnnyRig,
-    AnnyTopology,
     Axis,
     Body,
     ImportedBody,
     LegBody,
     MixedBody,
-    PhenotypeRanges,
     RiggedBody,
     SingleBody,
     SmalBody,
     SmplBody,
 )
+from datagen.recipe.clothed import OUTFITS, ClothedBody, DrapeSolver, GarmentPart, OwnOutfit
 from datagen.recipe.dataset import (
     ANIMALS,
     PATH_KEYS,
@@ -30,6 +28,7 @@ from datagen.recipe.poses import AmassPoses, ClipPoses, Distribution, FilePoses,
 
 __all__ = [
     "ANIMALS",
+    "OUTFITS",
     "PATH_KEYS",
     "AmassPoses",
     "AnnyBody",
@@ -38,18 +37,22 @@ __all__ = [
     "Axis",
     "Body",
     "ClipPoses",
+    "ClothedBody",
     "DatasetRecipe",
     "Distribution",
+    "DrapeSolver",
     "EvaluationTriples",
     "FilePoses",
     "FoundPoses",
     "Frozen",
+    "GarmentPart",
     "Growth",
     "IdentityRecipe",
     "ImportedBody",
     "LegBody",
     "MixedBody",
     "NptPoses",
+    "OwnOutfit",
     "PhenotypeRanges",
     "PoseRecipe",
     "Range",

@@ -10,11 +10,9 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from datagen.recipe.anny import AnnyBody
 from datagen.recipe.base import Frozen
-from datagen.recipe.bodies import (
-    AnnyBody,
-    Body,
-)
+from datagen.recipe.bodies import Body
 from datagen.recipe.poses import Distribution, NptPoses
 
 

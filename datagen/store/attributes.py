@@ -1,7 +1,7 @@
 """The root attributes of a dataset: their types, and whether a recipe and its assets fit those that are there."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NotRequired
 
 import zarr
 from pydantic import Field, TypeAdapter, ValidationError
@@ -56,6 +56,7 @@ class _Attributes(TypedDict):
     joint_parents: list[int]
     splits: dict[str, Any]
     rigs: list[_Parts]
+    labelled: NotRequired[list[int]]
 
 
 class _Complete(_Attributes):

@@ -14,7 +14,7 @@ _MEMBER = re.compile(
     |grid/(?:training|evaluation)/{_NUMBER}/(?:zarr\.json|(?:vertices|identity|pose|parameters)/zarr\.json
         |(?:identity|pose)/c/0|parameters/c/0/0|vertices/c/{_NUMBER}/{_NUMBER}/0/0)
     |topology/vertex_count/(?:zarr\.json|c/0)
-    |topology/{_NUMBER}/(?:zarr\.json|faces/zarr\.json|faces/c/0/0)
+    |topology/{_NUMBER}/(?:zarr\.json|(?:faces|part)/zarr\.json|faces/c/0/0|part/c/0)
     |pose/parameters/(?:zarr\.json|c/0/0/0)
     |evaluation/(?:seen|unseen)/(?:zarr\.json|c/0/0)
     |rig/number/(?:zarr\.json|c/0)

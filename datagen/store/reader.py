@@ -103,6 +103,14 @@ class Dataset:
                 self._topologies[topology] = self._faces_of(topology)
         return self._topologies[topology]
 
+    def part(self, identity: int) -> NDArray[np.int32] | None:
+        """What each vertex [vertex] of an identity belongs to: 0 skin, from 1 on garments; None of a bare body."""
+        topology = int(self.arrays.topologies[identity])
+        if topology not in self.attributes.get("labelled", ()):
+            return None
+        with self._damage():
+            return read_array(self.group, f"topology/{topology}/part", "int32", (self.arrays.vertices[topology],))
+
     def _faces_of(self, topology: int) -> NDArray[np.int32]:
         path, vertices = f"topology/{topology}/faces", self.arrays.vertices[topology]
         faces = read_array(self.group, path, "int32", (None, 3))

@@ -7,6 +7,7 @@ NAME.zarr                        status building|complete, recipe, splits, prove
   grid/SPLIT/T/parameters        (identity, parameter) float64, what the body model needs to make each again
   topology/vertex_count          (topology,) int32, vertices of a mesh of each topology
   topology/T/faces               (face, 3) int32
+  topology/T/part                (vertex,) int32, of dressed people: 0 skin, from 1 on the parts of the outfit
   pose/parameters                (pose, joint, 3) float64, axis-angle in radians
   rig/number                     (identity,) int32, the rig of each identity, -1: none; no group where there is no rig
   rig/R/weights                  (kind, vertex, part) float32, skinning weights

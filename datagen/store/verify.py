@@ -107,7 +107,9 @@ def _misfits(dataset: Dataset) -> Iterator[Fault]:
     arrays = _arrays(dataset)
     for array in arrays.arrays if arrays else ():
         first = int(array.identities[0])
-        reads += [partial(read, first) for read in (dataset.faces, dataset.parameters, dataset.vertex_count)]
+        reads += [
+            partial(read, first) for read in (dataset.faces, dataset.part, dataset.parameters, dataset.vertex_count)
+        ]
         reads.append(partial(dataset.check_axes, array))
     found = (damage_of(read) for read in reads)
     yield from dict.fromkeys(Fault(damage.path, damage.reason) for damage in found if damage)

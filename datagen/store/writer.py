@@ -52,6 +52,8 @@ class Plan:
         Of the body model, float64 [identity, parameter].
     faces
         Triangles int32 [face, 3] of each topology.
+    labels
+        The part int32 [vertex] that each vertex of a topology belongs to, by number, where bodies say so.
     poses
         Axis-angle rotations in radians, float64 [pose, joint, 3].
     triples
@@ -67,6 +69,7 @@ class Plan:
     arrays: GridArrays
     parameters: NDArray[np.float64]
     faces: Sequence[NDArray[np.int32]]
+    labels: Mapping[int, NDArray[np.int32]]
     poses: NDArray[np.float64]
     triples: Mapping[PoseType, NDArray[np.int32]]
     rigs: Sequence[Rigs]
@@ -83,6 +86,8 @@ class Plan:
         yield "topology/vertex_count", np.array(self.arrays.vertices, np.int32), ("topology",)
         for topology, faces in enumerate(self.faces):
             yield f"topology/{topology}/faces", faces, ("face", "corner")
+        for topology, labels in self.labels.items():
+            yield f"topology/{topology}/part", labels, ("vertex",)
         yield "pose/parameters", self.poses, ("pose", "joint", "axis")
         for pose_type, triples in self.triples.items():
             yield f"evaluation/{pose_type}", triples, ("triple", "column")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.bodies import BodyModel, load_body, require_joints
+from datagen.bodies import BodyModel, load_body, part_labels, require_joints
 from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
@@ -73,7 +73,8 @@ def test_outward_faces(family: Family) -> None:
 
 def test_poses_and_identities_change_the_mesh(family: Family) -> None:
     here, there = (family.body.vertices(family.identity(number), family.drawn(2)) for number in (1, 3))
-    assert np.abs(here[0] - here[1]).max() > 0.02 and np.abs(here - there).max() > 0.01
+    assert np.abs(here[0] - here[1]).max() > 0.02
+    assert here.shape != there.shape or np.abs(here - there).max() > 0.01
 
 
 def test_a_batch_gives_what_single_poses_give_to_the_bit(family: Family) -> None:
@@ -101,7 +102,9 @@ def test_its_rig_gives_its_vertices_without_it(family: Family, number: int, seed
     assert len(rig.joints) == len(rig.names) == len(set(rig.names)) == len(rig.parents) == len(rig.drivers)
     transforms = rig.transforms(world_rotations(poses.rotations, poses.parents))
     rest = rest_vertices(vertices[:4], rig.weights, transforms[:4])
-    assert np.abs(skinned(rest, rig.weights, transforms) - vertices).max() < 1e-5
+    labels = part_labels(family.body, parameters)
+    bare = slice(None) if labels is None else labels == 0
+    assert np.abs(skinned(rest, rig.weights, transforms) - vertices)[:, bare].max() < 1e-5, "draped cloth goes its way"
 
 
 def test_its_assets_say_what_it_is_made_from(family: Family) -> None:

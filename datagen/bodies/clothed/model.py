@@ -1,0 +1,144 @@
+"""People of Anny in clothes: the skin that shows, then the parts of an outfit, draped over the person in every pose."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from datagen.bodies import load_body
+from datagen.bodies.anny.model import AnnyModel
+from datagen.bodies.clothed.garments import BODY_VERTICES, Figure, Garment, covered, garment_of, helper_quads
+from datagen.bodies.skinning import Rest, rig_of, skin
+from datagen.mesh.rig import Rig, drivers_of, part_transforms
+from datagen.poses import JOINTS, PARENTS, Poses
+from datagen.recipe import AnnyBody, ClothedBody
+
+_GRID = 2.0**20
+
+
+def _postures() -> Poses:
+    """What patterns have room for: the T-pose, arms raised, sitting."""
+    degrees = np.zeros((3, len(JOINTS), 3))
+    for side, sign in (("left", 1), ("right", -1)):
+        degrees[1, JOINTS.index(f"{side}_shoulder"), 2] = 60 * sign
+        degrees[2, [JOINTS.index(f"{side}_hip"), JOINTS.index(f"{side}_knee")], 0] = -80, 80
+    return Poses(JOINTS, PARENTS, np.radians(degrees))
+
+
+_POSTURES = _postures()
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A dressed identity at rest: the skin that is kept and its faces, the body that cloth touches, and the garment."""
+
+    skin: Rest
+    skin_faces: NDArray[np.int64]
+    body: Rest
+    garment: Garment
+
+    @cached_property
+    def cloth(self) -> Any:
+        """The garment ready to be draped, made when asked for: it needs Warp."""
+        from datagen.bodies.clothed.draping import Cloth
+
+        return Cloth(self.garment, self.body.vertices.astype(np.float32), body_faces())
+
+
+class ClothedModel:
+    """See :class:`datagen.bodies.BodyModel`; frame: metres, Y up, facing +Z, +X to the body's left.
+
+    Parameters are Anny's, the outfit's number, and how many times its own ease it has.
+    """
+
+    def __init__(self, recipe: ClothedBody) -> None:
+        self._recipe = recipe
+        self._shown, self._whole = _anny(recipe.body), _anny(recipe.body.model_copy(update={"topology": "makehuman"}))
+        self.parameter_names = (*self._shown.parameter_names, "outfit", "ease")
+        self.joints, self.assets = self._shown.joints, self._shown.assets
+        joints = self._whole.bones.joints
+        self._joints = {joint: joints.index(joint) for joint in joints if joint}
+        self.person = lru_cache(maxsize=4)(self._person)
+
+    def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
+        """Anny's draws, outfit ``identity`` modulo their number, and ease uniform in the recipe's range."""
+        own = self._shown.draw_identity(random, identity)
+        return np.array([*own, identity % len(self._recipe.outfits), random.uniform(*self._recipe.ease)])
+
+    def faces(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Triangles [face, 3] of that identity: skin first."""
+        person = self.person(tuple(parameters.tolist()))
+        garment = person.garment.shown_faces + len(person.skin.vertices)
+        return np.concatenate([person.skin_faces, garment]).astype(np.int32)
+
+    def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
+        """Vertices [pose, vertex, 3] float32; each pose is draped from rest, alone."""
+        person = self.person(tuple(parameters.tolist()))
+        world, garment = self._whole.world_rotations(poses), person.garment
+        if self._recipe.method == "skinned":
+            dressed = skin(garment.rest, world)
+        else:
+            dressed = np.stack([self._draped(person, poses, pose) for pose in range(len(poses))])
+        return np.concatenate([skin(person.skin, world), dressed[:, garment.shown]], axis=1)
+
+    def _draped(self, person: Person, poses: Poses, pose: int) -> NDArray[np.float32]:
+        from datagen.bodies.clothed.draping import Path
+
+        time = np.arange(self._recipe.solver.frames + 1) / self._recipe.solver.frames
+        world = np.round(self._whole.on_the_way(poses, pose, time * time * (3 - 2 * time)) * _GRID) / _GRID
+        transforms = part_transforms(world, person.body.joints, person.body.parents)
+        path = Path(skin(person.body, world), np.round(transforms * _GRID) / _GRID)
+        draped: NDArray[np.float32] = person.cloth.drape(path, self._recipe.solver)
+        return draped
+
+    def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
+        """Anny's bones; garments have the weights of the skin below them, which is all that ``skinned`` ones follow."""
+        person, bones = self.person(tuple(parameters.tolist())), self._whole.bones
+        weights = [person.skin.weights, scipy.sparse.csr_array(person.garment.rest.weights)[person.garment.shown]]
+        rest = Rest(np.empty((0, 3)), person.skin.joints, scipy.sparse.vstack(weights).tocsr(), bones.parents)
+        drivers = drivers_of(bones.joints, bones.parents, joints)
+        return rig_of(rest, bones.labels, drivers, self._whole.corrections)
+
+    def part_labels(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
+        """What each vertex [vertex] belongs to: 0 skin, from 1 on the parts of the outfit, innermost first."""
+        person = self.person(tuple(parameters.tolist()))
+        garment = person.garment.part[person.garment.shown]
+        return np.concatenate([np.zeros(len(person.skin.vertices)), garment]).astype(np.int32)
+
+    def _person(self, parameters: tuple[float, ...]) -> Person:
+        *own, outfit, ease = parameters
+        whole, shown = (model.rest(np.array(own)) for model in (self._whole, self._shown))
+        parts, solver = self._recipe.outfit(int(outfit)), self._recipe.solver
+        garment = garment_of(
+            Figure(whole, self._joints), parts, ease=ease, subdivide=solver.subdivide, detail=self._recipe.detail
+        )
+        postures = tuple(skin(garment.rest, self._whole.world_rotations(_POSTURES)))
+        faces = self._shown.faces(np.array(own))
+        seen = faces[~covered(Figure(shown, self._joints), parts)[faces].all(axis=1)]
+        used, renumbered = np.unique(seen.astype(np.int64), return_inverse=True)
+        return Person(
+            _some(shown, used),
+            renumbered.reshape(-1, 3),
+            _some(whole, np.arange(BODY_VERTICES)),
+            replace(garment, postures=postures),
+        )
+
+
+def _anny(recipe: AnnyBody) -> AnnyModel:
+    body = load_body(recipe)
+    assert isinstance(body, AnnyModel)
+    return body
+
+
+def _some(rest: Rest, vertices: NDArray[np.int64]) -> Rest:
+    return Rest(rest.vertices[vertices], rest.joints, scipy.sparse.csr_array(rest.weights)[vertices], rest.parents)
+
+
+@lru_cache(maxsize=1)
+def body_faces() -> NDArray[np.int64]:
+    """Triangles [face, 3] of MakeHuman's body."""
+    quads = helper_quads()["body"]
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

