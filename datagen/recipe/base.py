@@ -22,3 +22,17 @@ class Frozen(BaseModel):
                 if isinstance(number, int) and abs(number) > LARGEST:
                     raise ValueError(f"{name} has {number.bit_length():,} bits, the largest whole number has 63")
         return self
+
+
+class BodySection(Frozen):
+    """Base of the sections of bodies, told apart by ``family``."""
+
+    @property
+    def expected_vertices(self) -> float | None:
+        """Vertices of a mesh, the mean where its meshes differ; None where they are known once the body is loaded."""
+        return None
+
+    @property
+    def seconds_a_mesh(self) -> float:
+        """Seconds of one core that a mesh takes beside what every mesh does."""
+        return 0.0

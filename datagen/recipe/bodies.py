@@ -5,20 +5,11 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from datagen.recipe.anny import AnnyBody
-from datagen.recipe.base import Frozen
+from datagen.recipe.base import BodySection
 from datagen.recipe.clothed import ClothedBody
 
 
-class _BodySection(Frozen):
-    """A body whose vertex count only its files tell."""
-
-    @property
-    def expected_vertices(self) -> float | None:
-        """Vertices of a mesh, known before the body is loaded; the mean where its meshes differ."""
-        return None
-
-
-class LegBody(_BodySection):
+class LegBody(BodySection):
     """A procedural two-bone leg: no assets, milliseconds to load; for tests and for trying the pipeline out."""
 
     family: Literal["leg"] = "leg"
@@ -30,7 +21,7 @@ class LegBody(_BodySection):
         return self.rings * self.segments
 
 
-class SmplBody(_BodySection):
+class SmplBody(BodySection):
     """SMPL, SMPL-H or SMPL-X from a model file of the user's (.npz, or the original .pkl)."""
 
     family: Literal["smpl"] = "smpl"
@@ -45,7 +36,7 @@ class SmplBody(_BodySection):
     beta_range: float = Field(4.0, gt=0, description="shape parameters are uniform within +- this (NPT: 4)")
 
 
-class SmalBody(_BodySection):
+class SmalBody(BodySection):
     """SMAL animals (33 to 35 joints, 41 betas) from a model file of the user's in SMPL's layout."""
 
     family: Literal["smal"] = "smal"
@@ -57,7 +48,7 @@ class SmalBody(_BodySection):
     beta_range: float = Field(1.0, gt=0, description="shape parameters are uniform within +- this (about the mean)")
 
 
-class RiggedBody(_BodySection):
+class RiggedBody(BodySection):
     """Rigged glTF characters that share joint names: the twelve CC0 animals, or a folder of .glb and .gltf files."""
 
     family: Literal["rigged"] = "rigged"
@@ -88,7 +79,7 @@ class RiggedBody(_BodySection):
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
-class ImportedBody(_BodySection):
+class ImportedBody(BodySection):
     """Meshes that exist already, as files: nothing is synthesised, but everything else holds."""
 
     family: Literal["imported"] = "imported"
@@ -128,7 +119,7 @@ SingleBody = Annotated[
 ]
 
 
-class MixedBody(_BodySection):
+class MixedBody(BodySection):
     """Several bodies in one dataset: identity i is of body i modulo their number; all take the same poses."""
 
     family: Literal["mixed"] = "mixed"
@@ -139,6 +130,10 @@ class MixedBody(_BodySection):
         counts = [body.expected_vertices for body in self.bodies]
         known = [count for count in counts if count is not None]
         return sum(known) / len(known) if len(known) == len(counts) else None
+
+    @property
+    def seconds_a_mesh(self) -> float:
+        return sum(body.seconds_a_mesh for body in self.bodies) / len(self.bodies)
 
 
 Body = Annotated[

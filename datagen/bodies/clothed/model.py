@@ -84,6 +84,10 @@ class ClothedModel:
             dressed = np.stack([self._draped(person, poses, pose) for pose in range(len(poses))])
         return np.concatenate([skin(person.skin, world), dressed[:, garment.shown]], axis=1)
 
+    def world_rotations(self, poses: Poses) -> NDArray[np.float64]:
+        """World rotations [pose, bone, 3, 3] of Anny's bones relative to their rest."""
+        return self._whole.world_rotations(poses)
+
     def _draped(self, person: Person, poses: Poses, pose: int) -> NDArray[np.float32]:
         from datagen.bodies.clothed.draping import Path
 
