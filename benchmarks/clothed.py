@@ -71,13 +71,9 @@ def measure(identities: int, poses: int, subdivide: int) -> None:
     finer = usual.model_copy(update={"frames": 2 * usual.frames, "substeps": 2 * usual.substeps, "settle": 480})
     model, fine = (ClothedModel(ClothedBody(body=body, detail=subdivide, solver=its)) for its in (usual, finer))
     drawn = draw_poses(PoseRecipe(), range(poses))
-    print(
-        print("outfit | vertices | CPU s a pose | > 2 mm inside: median, worst | stretch: p50, p99 | finer | skinned")
-    )
-    for outfit in OUTFITS:
-        print(
-            outfit, "|", " | ".join(_measured(model, fine, list(OUTFITS).index(outfit), identities, drawn)), flush=True
-        )
+    print("outfit | vertices | CPU s a pose | > 2 mm inside: median, worst | stretch: p50, p99 | finer | skinned")
+    for number, outfit in enumerate(OUTFITS):
+        print(outfit, "|", " | ".join(_measured(model, fine, number, identities, drawn)), flush=True)
 
 
 def _measured(model: ClothedModel, fine: ClothedModel, outfit: int, identities: int, poses: Poses) -> list[str]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from datagen.bodies.clothed.garments import Garment
 from datagen.bodies.clothed.kernels import STEP, Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
+from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
 from datagen.recipe import DrapeSolver
 
@@ -24,6 +25,7 @@ _STRETCHED, _COMPRESSED = 1e-10, 1e-7  # compliance of edges, metres a newton
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
 _TOGETHER = 10  # steps of settling between two searches for contacts
 _DEEP, _MOST_DEEP = 0.01, 0.05  # metres inside of the body at rest, and the share of vertices that may be
+_NEAR, _KIN = 60, 0.02  # triangles that a pin chooses from; the product of weights from which a bone moves both
 _GRID = 2.0**20
 
 
@@ -44,15 +46,15 @@ class Path:
 
 
 class Cloth:
-    """A garment ready to be draped over a body whose faces are ``body_faces`` [face, 3] and whose rest is ``body``."""
+    """A garment ready to be draped over a body whose faces are ``faces`` [face, 3]."""
 
-    def __init__(self, garment: Garment, body: NDArray[np.float32], body_faces: NDArray[np.int64]) -> None:
-        self._garment = garment
+    def __init__(self, garment: Garment, worn_by: Rest, faces: NDArray[np.int64]) -> None:
+        self._garment, body = garment, worn_by.vertices.astype(np.float32)
         vertices = garment.rest.vertices
         self._edges, self._bends = _springs(garment)
-        _require_outside(vertices, body, body_faces)
-        self._mesh = wp.Mesh(points=_vectors(body), indices=_integers(body_faces.ravel()))
-        self._pins = _pins(garment, body, body_faces)
+        _require_outside(vertices, body, faces)
+        self._mesh = wp.Mesh(points=_vectors(body), indices=_integers(faces.ravel()))
+        self._pins = _pins(garment, worn_by, faces)
         self._skin = _skin_of(garment)
         state = State()
         for name in ("place", "before", "velocity", "contact", "normal", "under", "under_normal"):
@@ -152,12 +154,11 @@ def _skin_of(garment: Garment) -> Any:
     return skin
 
 
-def _pins(garment: Garment, body: NDArray[np.float32], faces: NDArray[np.int64]) -> Any:
-    """Hang each pinned vertex on the triangle whose middle is nearest, where it is at rest."""
+def _pins(garment: Garment, body: Rest, faces: NDArray[np.int64]) -> Any:
+    """Hang each pinned vertex, where it is at rest, on a triangle near it (:func:`_nearest_kin`)."""
     pins, vertices = Pins(), np.flatnonzero(garment.pinned)
-    places, corners = garment.rest.vertices[vertices], body.astype(np.float64)[faces]
-    tree = scipy.spatial.cKDTree(corners.mean(axis=1))
-    nearest = tree.query(places)[1]
+    places, corners = garment.rest.vertices[vertices], body.vertices[faces]
+    nearest = _nearest_kin(garment.rest, vertices, body, faces)
     a, b, c = corners[nearest].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
     area = (across**2).sum(axis=1)
@@ -167,6 +168,15 @@ def _pins(garment: Garment, body: NDArray[np.float32], faces: NDArray[np.int64])
     pins.barycentric = _vectors(np.stack([1 - second - third, second, third], axis=1))
     pins.above = _numbers(((places - a) * across).sum(axis=1) / np.sqrt(area))
     return pins
+
+
+def _nearest_kin(rest: Rest, vertices: NDArray[np.int64], body: Rest, faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The triangle [vertex] with the nearest middle of those that move by a bone of the vertex, so no hand by a waist."""
+    distances, near = scipy.spatial.cKDTree(body.vertices[faces].mean(axis=1)).query(rest.vertices[vertices], _NEAR)
+    mine, theirs = scipy.sparse.csr_array(rest.weights)[vertices], scipy.sparse.csr_array(body.weights)
+    kin = [mine.multiply(theirs[faces[triangles, 0]]).sum(axis=1) > _KIN for triangles in near.T]
+    best = np.where(np.stack(kin, axis=1), distances, distances + _FAR).argmin(axis=1)
+    return np.asarray(np.take_along_axis(near, best[:, None], axis=1)[:, 0], np.int64)
 
 
 def _masses(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -229,9 +229,10 @@ def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide
 
 
 def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
-    surface = surface_of(helper_quads()[part.group], len(figure.rest.vertices))
+    quads, vertices = helper_quads()[part.group], figure.rest.vertices
     if part.front == "open":
-        surface = surface.keep(~_in_front(surface, figure.rest.vertices))
+        quads = quads[~_in_front(vertices[quads].mean(axis=1))]
+    surface = surface_of(quads, len(vertices))
     for level in figure.levels(part):
         surface = cut(surface, surface.of(level))
         if not len(surface.faces):
@@ -243,11 +244,9 @@ def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
     return surface.largest_piece()
 
 
-def _in_front(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The faces [face] of the column that is nearest to the middle in front."""
-    middles = surface.of(vertices)[surface.faces].mean(axis=1)
-    width = np.ptp(middles[:, 0])
-    return (np.abs(middles[:, 0]) < width / 24) & (middles[:, 2] > np.median(middles[:, 2]))
+def _in_front(middles: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The quads [quad], given their middles [quad, 3], of the column that is nearest to the middle in front."""
+    return (np.abs(middles[:, 0]) < np.ptp(middles[:, 0]) / 24) & (middles[:, 2] > np.median(middles[:, 2]))
 
 
 def _flared(vertices: NDArray[np.float64], flare: float) -> NDArray[np.float64]:

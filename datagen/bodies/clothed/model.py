@@ -45,7 +45,7 @@ class Person:
         """The garment ready to be draped, made when asked for: it needs Warp."""
         from datagen.bodies.clothed.draping import Cloth
 
-        return Cloth(self.garment, self.body.vertices.astype(np.float32), body_faces())
+        return Cloth(self.garment, self.body, body_faces())
 
 
 class ClothedModel:

@@ -11,8 +11,9 @@ import pytest
 from pydantic import ValidationError
 
 from datagen.bodies import load_body, part_labels
+from datagen.bodies.clothed.draping import _nearest_kin
 from datagen.bodies.clothed.garments import Figure, garment_of, helper_quads
-from datagen.bodies.clothed.model import ClothedModel
+from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.clothed.surface import borders
 from datagen.bodies.skinning import skin
 from datagen.common.errors import BodyError
@@ -62,6 +63,16 @@ def test_hems_are_level(model: ClothedModel) -> None:
     garment = garment_of(figure, [GarmentPart(low=0.4, high=2.9, ease=0.0)], ease=1.0, subdivide=0, detail=0)
     rings = [garment.rest.vertices[ring, 1] for ring in borders(garment.faces)]
     assert len(rings) == 3 and all(np.ptp(ring) < 0.004 for ring in rings), "but for what a normal leans"
+
+
+def test_a_childs_skirt_does_not_hang_on_its_hands(model: ClothedModel) -> None:
+    person = model.person((0.5, 0.3, 0.5, 0.5, 0.5, 0.5, list(OUTFITS).index("skirt"), 1.0))
+    waist = np.flatnonzero(person.garment.pinned & (person.garment.part == 2))
+    chosen = _nearest_kin(person.garment.rest, waist, person.body, body_faces())
+    arms = Figure(person.body, model._joints)._weight_below("left_shoulder")
+    assert arms[body_faces()[chosen]].max() < 0.5
+    middles = person.body.vertices[body_faces()[chosen]].mean(axis=1)
+    assert np.linalg.norm(middles - person.garment.rest.vertices[waist], axis=1).max() < 0.08
 
 
 def test_skin_under_clothes_is_not_kept_and_labels_say_what_is_what(model: ClothedModel) -> None:
