@@ -171,7 +171,7 @@ def _pins(garment: Garment, body: Rest, faces: NDArray[np.int64]) -> Any:
 
 
 def _nearest_kin(rest: Rest, vertices: NDArray[np.int64], body: Rest, faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The triangle [vertex] with the nearest middle of those that move by a bone of the vertex, so no hand by a waist."""
+    """The triangle [vertex] with the nearest middle of those that one of its bones moves: no hand by a waist."""
     distances, near = scipy.spatial.cKDTree(body.vertices[faces].mean(axis=1)).query(rest.vertices[vertices], _NEAR)
     mine, theirs = scipy.sparse.csr_array(rest.weights)[vertices], scipy.sparse.csr_array(body.weights)
     kin = [mine.multiply(theirs[faces[triangles, 0]]).sum(axis=1) > _KIN for triangles in near.T]
