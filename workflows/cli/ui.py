@@ -34,9 +34,10 @@ def ui_command(options: argparse.Namespace) -> None:
         raise DatasetError(
             f"{database} is not there yet: python workflows/full.py makes it; for another folder: dsffnet ui FOLDER"
         )
-    _require_free(options.port)
-    server = _server(database, options.port)
-    print(_addresses(database, options.port), flush=True)
+    port = options.port
+    require_free("127.0.0.1", port, another=f"dsffnet ui --port {port + 1}, or make ui UI_PORT={port + 1}")
+    server = _server(database, port)
+    print(_addresses(database, port), flush=True)
     status = _serve(server, ended=_parent_is_gone())
     if status:
         raise PageError(f"MLflow's server ended with status {status}; its words are above")
@@ -60,16 +61,21 @@ def _addresses(database: Path, port: int) -> str:
     return "\n".join([*lines, "Ready in some seconds; Ctrl-C ends it."])
 
 
-def _require_free(port: int) -> None:
+def require_free(host: str, port: int, *, another: str) -> None:
+    """Refuse a port that cannot be listened at; ``another``: what to type for another one.
+
+    Raises
+    ------
+    PageError
+        It is taken, or not to be had.
+    """
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise PageError(
-                f"port {port} of 127.0.0.1 cannot be used ({error.strerror}). Another: dsffnet ui --port {port + 1}, "
-                f"or make ui UI_PORT={port + 1}"
-            ) from error
+            probe.bind((host, port))
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise PageError(f"port {port} of {host} cannot be used ({reason}). Another: {another}") from error
 
 
 def _parent_is_gone() -> Callable[[], bool]:

@@ -1,5 +1,6 @@
 """Which of the weights that come along pose two meshes: those of people, or those of animals."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
+Load = Callable[..., PoseTransfer]
+"""As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +26,9 @@ class Chosen:
     standings: Pair
 
     @classmethod
-    def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> "Chosen":
+    def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh], load: Load) -> "Chosen":
         """The weights named so, of a network that finds how meshes stand."""
-        transfer = PoseTransfer.from_run(weights)
+        transfer = load(weights)
         return cls(weights, transfer, standings(transfer, job, meshes))
 
 
@@ -43,7 +46,7 @@ def _told(transfer: PoseTransfer, axes: Axes, mesh: Mesh) -> Standing:
     return Standing(axes.matrix, transfer.misfit(axes.turned(mesh.vertices)))
 
 
-def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool) -> Chosen:
+def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Load | None = None) -> Chosen:
     """Return the weights that know both meshes best; of meshes that none knows, those of people.
 
     The others are not asked where people's know both well: among all the ways to turn an animal there may be one in
@@ -54,10 +57,12 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool) -> Chose
     MeshError
         One is a person and one an animal, and it is not forced.
     """
-    people = Chosen.of(own_weights("human"), job, meshes)
+    load = load or PoseTransfer.from_run
+    people = Chosen.of(own_weights("human"), job, meshes, load)
     if all(found.misfit <= KNOWN for found in people.standings):
         return people
-    every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes) for name in KINDS if name != "human"}
+    others = [name for name in KINDS if name != "human"]
+    every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes, load) for name in others}
     source, target = (_kind(every, place) for place in range(2))
     if source and target and source != target and not force:
         raise MeshError(

@@ -5,7 +5,7 @@ import os
 import shutil
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import count
@@ -24,7 +24,7 @@ from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
-from workflows.transfer.choice import chosen, standings
+from workflows.transfer.choice import Load, chosen, standings
 from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
@@ -45,20 +45,37 @@ class TransferWork:
     """A job whose meshes are read and whose network is loaded."""
 
     def __init__(
-        self, job: TransferJob, transfer: PoseTransfer, *, first: Mesh, target: MeshFile, by: str = ""
+        self,
+        job: TransferJob,
+        transfer: PoseTransfer,
+        *,
+        first: Mesh,
+        target: MeshFile,
+        by: str = "",
+        warn: Callable[[str], None] = warn,
     ) -> None:
         """``first`` is the source, or the first frame of a sequence; ``by``: weights that were chosen."""
         self.job, self.transfer, self.first, self.target = job, transfer, first, target
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
-        self._by = by
+        self.by, self._warn = by, warn
         self._shown: dict[int, Mesh] = {}
         self._played: dict[int, Mesh] = {}
 
     @classmethod
     def of(
-        cls, job: TransferJob, weights: Path | None, *, first: Mesh, target: MeshFile, force: bool
+        cls,
+        job: TransferJob,
+        weights: Path | None,
+        *,
+        first: Mesh,
+        target: MeshFile,
+        force: bool,
+        load: Load | None = None,
+        warn: Callable[[str], None] = warn,
     ) -> "TransferWork":
         """The job by weights, or by those of the project's own that know both meshes; how these stand is settled.
+
+        ``load`` makes a network of weights, ``warn`` takes what is to be known of the meshes, a line each.
 
         Raises
         ------
@@ -67,11 +84,12 @@ class TransferWork:
         """
         meshes = first, target.mesh
         if weights is None:
-            found = chosen(job, meshes, force=force)
-            work = cls(job, found.transfer, first=first, target=target, by=found.weights.name)
+            found = chosen(job, meshes, force=force, load=load)
+            work = cls(job, found.transfer, first=first, target=target, by=found.weights.name, warn=warn)
             work._take(found.standings, found.weights)
             return work
-        work = cls(job, PoseTransfer.from_run(weights, project=job.project), first=first, target=target)
+        transfer = (load or PoseTransfer.from_run)(weights, project=job.project)
+        work = cls(job, transfer, first=first, target=target, warn=warn)
         if work.transfer.finds_standing:
             work._take(standings(work.transfer, job, meshes), weights)
         else:
@@ -90,11 +108,11 @@ class TransferWork:
         for (path, mesh), axes, way in zip(meshes, taken, ways, strict=True):
             both = ways[0].axes, ways[1].axes
             if self.job.axes is None and not way.is_certain:
-                warn(f"--align leaves {path} as it is: how it stands is not certain")
+                self._warn(f"--align leaves {path} as it is: how it stands is not certain")
             for line in remarks(
                 mesh, name=str(path), axes=axes, way=way, both=both, stated=self.job.is_told, seen=seen
             ):
-                warn(line)
+                self._warn(line)
 
     def _take(self, found: tuple[Standing, Standing], weights: Path) -> None:
         """Turn the meshes as they were found to stand; warn of those that the network does not know."""
@@ -102,14 +120,14 @@ class TransferWork:
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
         for (path, mesh), axes in zip(meshes, found, strict=True):
             for line in remarks(mesh, name=str(path), axes=axes, way=None, both=None, stated=stated, seen=seen):
-                warn(line)
+                self._warn(line)
 
     def run(self) -> str:
         """Write everything; what was done, in a line."""
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
         if self.job.drawn:
             self._draw()
-        return f"{done}, by the weights {self._by}" if self._by else done
+        return f"{done}, by the weights {self.by}" if self.by else done
 
     def _votes(self) -> list[NDArray[np.floating]]:
         count = len(self.job.sources)
@@ -120,7 +138,7 @@ class TransferWork:
         return self.first if number == 0 else self.job.read_source(number).mesh
 
     def _write_pair(self) -> str:
-        job, posed = self.job, next(self._posed())
+        job, posed = self.job, next(self._kept())
         self._write_posed(posed, job.out)
         return f"{job.out}: {len(posed.vertices):,} vertices of {job.target} in the pose of {job.sources[0]}"
 
@@ -129,7 +147,7 @@ class TransferWork:
         about = f"{job.out}: {len(job.sources)} frames of {job.target}"
         if job.is_file:
             require_animation(self.target, len(job.sources))
-            self._animate(self._posed(), job.animation)
+            self._animate(self._kept(), job.animation)
             return about
         with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
             try:
@@ -147,7 +165,7 @@ class TransferWork:
 
     def _saved(self, folder: Path) -> Iterator[Mesh]:
         """The frames, each written to its file as it passes."""
-        for number, posed in enumerate(self._posed()):
+        for number, posed in enumerate(self._kept()):
             place = folder / self.job.frame_file(self.job.sources[number]).name
             self._write_posed(posed, place, beside=not number)  # what lies beside the first lies beside all
             yield posed
@@ -157,19 +175,23 @@ class TransferWork:
         for line in lost if beside else ():
             warn(line)
 
-    def _posed(self) -> Iterator[Mesh]:
-        """The output of every frame; those that picture and page show are kept."""
-        count = len(self.job.sources)
-        kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
-        played = range(0, count, self._frames_apart) if self._is_played else range(0)
-        frames = self.transfer.sequence(
-            map(self._source, range(count)),
+    def posed(self) -> Iterator[Mesh]:
+        """The target in the pose of every source, one after the other."""
+        return self.transfer.sequence(
+            map(self._source, range(len(self.job.sources))),
             self.target.mesh,
             smooth=self.job.window,
             refine=REFINE_WEIGHT if self.job.refine else 0.0,
             source_axes=self.axes[0],
             target_axes=self.axes[1],
         )
+
+    def _kept(self) -> Iterator[Mesh]:
+        """The outputs, with a bar for those of a sequence; those that picture and page show are kept."""
+        count = len(self.job.sources)
+        kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
+        played = range(0, count, self._frames_apart) if self._is_played else range(0)
+        frames = self.posed()
         if self.job.is_sequence:
             from workflows.pipeline.progress import bar
 

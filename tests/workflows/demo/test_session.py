@@ -1,0 +1,211 @@
+"""Sessions: the newest counts, two know nothing of each other, and nothing stays when one ends."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datagen.bodies import load_body
+from datagen.common.errors import MeshError
+from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.geometry import Mesh
+from datagen.poses import draw_poses
+from datagen.recipe import LegBody, PoseRecipe, RangePoses
+from workflows.cli import main as cli
+from workflows.demo.newest import Newest
+from workflows.demo.session import Session
+from workflows.demo.transfers import Asked, Outcome, Switches, Transfers
+from workflows.pretrained import own_weights
+
+STANDING = Switches(up="Y", front="Z")
+
+
+class Seen:
+    """What a page would show."""
+
+    def __init__(self) -> None:
+        self.frames, self.failures, self.done = list[Outcome](), list[str](), threading.Semaphore(0)
+
+    def posing(self) -> None:
+        pass
+
+    def show(self, outcome: Outcome) -> None:
+        self.frames.append(outcome)
+        if len(outcome.frames) == outcome.count:
+            self.done.release()
+
+    def fail(self, message: str) -> None:
+        self.failures.append(message)
+        self.done.release()
+
+    def wait(self) -> None:
+        assert self.done.acquire(timeout=120)
+
+
+@pytest.fixture(scope="module")
+def transfers() -> Transfers:
+    return Transfers(own_weights("human"))
+
+
+@pytest.fixture
+def view() -> Seen:
+    return Seen()
+
+
+@pytest.fixture
+def session(tmp_path: Path, transfers: Transfers, view: Seen) -> Iterator[Session]:
+    made = Session(tmp_path / "session", transfers, view)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def legs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Files of one body in three poses."""
+    body, folder = load_body(LegBody(rings=8, segments=6)), tmp_path_factory.mktemp("legs")
+    parameters = body.draw_identity(np.random.default_rng(0), 0)
+    poses = draw_poses(PoseRecipe(distribution=RangePoses(degrees={"left_knee": ((0, 90), (0, 0), (0, 0))})), range(3))
+    vertices, faces = body.vertices(parameters, poses), body.faces(parameters)
+    for number, each in enumerate(vertices):
+        save_mesh(Mesh(each, faces), folder / f"leg{number}.obj")
+    return sorted(folder.iterdir())
+
+
+def upload(session: Session, role: str, path: Path) -> tuple[Path, ...]:
+    return session.keep(role, path.name, path.read_bytes())
+
+
+class TestNewest:
+    def test_of_what_waits_only_the_newest_is_done(self) -> None:
+        done, began, go = list[int](), threading.Event(), threading.Event()
+
+        def work(asked: int, stale: Callable[[], bool]) -> None:
+            began.set()
+            go.wait(10)
+            done.append(asked)
+
+        newest = Newest(work)
+        newest.ask(0)
+        began.wait(10)
+        for asked in range(1, 100):  # as a slider that is dragged
+            newest.ask(asked)
+        go.set()
+        while done[-1:] != [99]:
+            assert len(done) < 3
+        newest.close()
+        assert done == [0, 99]
+
+    def test_long_work_is_told_that_something_newer_waits(self) -> None:
+        told, began = list[int](), threading.Event()
+
+        def work(asked: int, stale: Callable[[], bool]) -> None:
+            began.set()
+            while asked == 0 and not stale():
+                pass
+            told.append(asked)
+
+        newest = Newest(work)
+        newest.ask(0)
+        began.wait(10)
+        newest.ask(1)
+        while told != [0, 1]:
+            pass
+        newest.close()
+
+
+def test_the_result_is_that_of_the_command_line(
+    session: Session, view: Seen, legs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, target = upload(session, "source", legs[1]), upload(session, "target", legs[0])
+    session.ask(Asked(source, target, Switches(up="Y", front="Z", refine=True)))
+    view.wait()
+    assert not view.failures
+    name, content = session.result(".obj")
+    out = tmp_path / "posed.obj"
+    options = ["--model", "human", "--up", "Y", "--front", "Z", "--refine"]
+    cli.main(["transfer", str(legs[1]), str(legs[0]), "-o", str(out), *options])
+    assert content == out.read_bytes()
+    assert name == "leg0-posed.obj"
+    assert not np.allclose(load_mesh(out).vertices, load_mesh(legs[0]).vertices, atol=1e-3)
+
+
+def test_frames_come_one_after_the_other_and_go_into_one_animation(
+    session: Session, view: Seen, legs: list[Path]
+) -> None:
+    target = upload(session, "target", legs[0])
+    session.ask(Asked(tuple(legs), target, STANDING, moving=True))
+    view.wait()
+    assert [outcome.count for outcome in view.frames] == [3, 3, 3]
+    name, content = session.result(".glb")
+    assert name == "leg0-posed.glb" and b'"animations"' in content
+
+
+def test_a_broken_file_is_refused_in_one_line_and_the_last_one_stays(session: Session, legs: list[Path]) -> None:
+    kept = upload(session, "source", legs[0])
+    with pytest.raises(MeshError, match=r"broken\.obj") as refused:
+        session.keep("source", "broken.obj", b"v 0 0 0\nf 1 2 9\n")
+    assert "\n" not in str(refused.value)
+    assert session.plain(refused.value).startswith("broken.obj")
+    assert kept[0].exists()
+
+
+def test_only_the_last_uploads_are_kept(session: Session, legs: list[Path], tmp_path: Path) -> None:
+    for _ in range(5):
+        kept = upload(session, "source", legs[0])
+    assert kept[0].exists() and len(list((tmp_path / "session").glob("source-*"))) == 2
+
+
+def test_what_cannot_be_posed_is_said_and_the_next_can(session: Session, view: Seen, legs: list[Path]) -> None:
+    target = upload(session, "target", legs[0])
+    session.ask(Asked((legs[0],), target, STANDING, moving=True))
+    view.wait()
+    assert "frames to play come as a .zip" in view.failures[0]
+    session.ask(Asked((legs[1],), target, STANDING))
+    view.wait()
+    assert view.frames and session.outcome is not None
+
+
+def test_more_vertices_than_the_page_takes(session: Session, legs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workflows.demo.transfers.VERTEX_LIMIT", 10)
+    with pytest.raises(MeshError, match="the page takes 10: decimate it, or use dsffnet transfer"):
+        upload(session, "target", legs[0])
+
+
+def test_nothing_to_download_before_anything_is_posed(session: Session) -> None:
+    with pytest.raises(MeshError, match="nothing is posed yet"):
+        session.result(".glb")
+
+
+def test_two_sessions_do_not_see_each_other_and_leave_nothing(
+    tmp_path: Path, transfers: Transfers, legs: list[Path]
+) -> None:
+    views = [Seen(), Seen()]
+    two = [Session(tmp_path / str(number), transfers, view) for number, view in enumerate(views)]
+    uploaded = [upload(session, "target", path) for session, path in zip(two, legs, strict=False)]
+    for session, target in zip(two, uploaded, strict=True):
+        session.ask(Asked((legs[2],), target, STANDING))
+    for view in views:
+        view.wait()
+    first, second = (session.result(".obj") for session in two)
+    assert (first[0], second[0]) == ("leg0-posed.obj", "leg1-posed.obj") and first[1] != second[1]
+    two[0].close()
+    assert not (tmp_path / "0").exists() and uploaded[1][0].exists()
+    two[1].close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unexpected_failure_is_said_and_ends_nothing(tmp_path: Path, legs: list[Path]) -> None:
+    class Failing:
+        def run(self, *_: Any) -> None:
+            raise ZeroDivisionError("one in a thousand")
+
+    view = Seen()
+    session = Session(tmp_path / "s", Failing(), view)  # type: ignore[arg-type]
+    for _ in range(2):
+        session.ask(Asked((legs[0],), (legs[1],)))
+        view.wait()
+    session.close()
+    assert len(view.failures) == 2 and "one in a thousand" in view.failures[0]

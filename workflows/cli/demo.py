@@ -1,0 +1,52 @@
+"""``dsffnet demo``: a page in the browser on which meshes are posed like each other."""
+
+import argparse
+import contextlib
+import threading
+
+from workflows.cli.declare import Command, Parser, add_checkpoint_option
+from workflows.cli.transfer import add_model_option, weights_of
+from workflows.cli.ui import require_free
+from workflows.pipeline.console import print_text
+
+
+def demo_command(options: argparse.Namespace) -> None:
+    """Show a page in the browser: pick a source and a target, people, animals or your own meshes, and look.
+
+    examples:
+      dsffnet demo
+      dsffnet demo --model runs/quickstart --port 8001
+    """
+    require_free(options.host, options.port, another=f"dsffnet demo --port {options.port + 1}")
+    print_text("reading the weights and the bodies (a minute where Anny is read for the first time) ...")
+    from workflows.demo.server import DemoServer
+    from workflows.demo.transfers import Transfers
+
+    with weights_of(options) as weights:
+        transfers = Transfers(weights)
+        transfers.warm_up()
+        server = DemoServer(transfers, host=options.host, port=options.port)
+        print_text(f"http://{options.host}:{server.port}   (Ctrl-C ends it)")
+        with contextlib.closing(server):
+            _until_interrupted()
+
+
+def _until_interrupted() -> None:
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("the page is closed, and what was uploaded is removed") from interrupt
+
+
+def _demo_options(made: Parser) -> None:
+    add_model_option(made)
+    add_checkpoint_option(made)
+    made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
+    made.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at; anyone who reaches it may use it (%(default)s)"
+    )
+    made.add_argument("--port", type=int, default=8080, help="where to listen (default: %(default)s)")
+    made.set_defaults(force=False)
+
+
+COMMAND = Command(demo_command, _demo_options)

@@ -1,0 +1,216 @@
+"""The page that one person sees: controls at the side, three bodies, and what can be said of the result."""
+
+import threading
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from datagen.common.errors import DsffnetError
+from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
+from training.viz.style import ERROR_COLORS
+from workflows.demo.bodies import PERSON, Figure, random_figure
+from workflows.demo.controls import BodyControls
+from workflows.demo.session import Session
+from workflows.demo.stage import Stage
+from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers
+
+_STYLE = """<style>
+input[type=file] { display: block !important; width: calc(100% - 20px); margin: 0 10px 6px; padding: 14px 10px;
+  border: 1.5px dashed #b9c0ca; border-radius: 6px; background: #f5f6f8; font: 13px system-ui, sans-serif;
+  color: #5d6676; box-sizing: border-box; cursor: pointer; }
+input[type=file] ~ button { display: none; }
+</style>"""
+_AS_FOUND, _WITHOUT = "as found", "none"
+_SMOOTH_FRAMES = 7
+_BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
+
+
+class Page:
+    """One person's page; see :class:`workflows.demo.session.View`."""
+
+    def __init__(self, client: viser.ClientHandle, folder: Path, transfers: Transfers) -> None:
+        self._client, self._transfers = client, transfers
+        self.session = Session(folder, transfers, self)
+        self._closed = threading.Event()
+        self._stage = Stage(client)
+        self._drawing = threading.RLock()
+        self._frame = 0
+        gui = client.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(47, 98, 181))
+        gui.set_panel_label("dsffnet · pose transfer")
+        gui.main_panel.dock_right()
+        gui.add_html(_STYLE)
+        self._status = gui.add_markdown("")
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._add_tabs()
+        self._add_result()
+        threading.Thread(target=self._play, daemon=True).start()
+        self.ask()
+
+    def ask(self) -> None:
+        """Pose what the controls say."""
+        source, target = self._source.body(), self._target.body()
+        if source is None or target is None:
+            return
+        moving = self._moving.value or (not isinstance(source, Figure) and len(source) > 1)
+        self.session.ask(Asked(source, target, self._switches(), moving=moving))
+
+    def posing(self) -> None:
+        """Say that a transfer has begun."""
+        self._stage.say("output", "posing …")
+        self._status.content = "posing …"
+
+    def show(self, outcome: Outcome) -> None:
+        """Show the frame that is done; the others are played."""
+        self._progress.visible = len(outcome.frames) < outcome.count
+        self._progress.value = 100 * len(outcome.frames) / outcome.count
+        if len(outcome.frames) == 1:
+            self._draw(outcome, outcome.frames[0])
+            self._stage.arrange()
+        self._status.content = _about(outcome)
+
+    def fail(self, message: str) -> None:
+        """Say what cannot be done; what is shown stays."""
+        self._stage.say("output")
+        self._progress.visible = False
+        self._status.content = "nothing was posed"
+        self._client.add_notification("That cannot be posed", message, color="red", auto_close_seconds=20)
+
+    def close(self) -> None:
+        """End everything of this page, and its folder."""
+        self._closed.set()
+        self.session.close()
+
+    def _add_tabs(self) -> None:
+        gui, random = self._client.gui, np.random.default_rng()
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Source", viser.Icon.RUN):
+            gui.add_markdown("Gives the **pose**.")
+            takes = "OBJ, PLY, GLB, OFF, STL, or a .zip of frames"
+            self._source = self._controls("source", random_figure(PERSON, random), takes)
+        with tabs.add_tab("Target", viser.Icon.USER):
+            gui.add_markdown("Gives the **body**; its own pose does not matter.")
+            takes = "OBJ, PLY, GLB, OFF, STL, or a .zip with its materials"
+            self._target = self._controls("target", random_figure(PERSON, random), takes)
+        with tabs.add_tab("Options", viser.Icon.ADJUSTMENTS):
+            self._add_switches()
+
+    def _controls(self, role: str, first: Figure, takes: str) -> BodyControls:
+        def keep(name: str, content: bytes) -> tuple[Path, ...]:
+            return self.session.keep(role, name, content)
+
+        return BodyControls(
+            self._client.gui, first, keep, changed=self.ask, failed=lambda error: self.fail(self.session.plain(error)),
+            takes=takes,
+        )  # fmt: skip
+
+    def _add_switches(self) -> None:
+        gui, own = self._client.gui, self._transfers.weights is None
+        self._refine = gui.add_checkbox("Refine", False, hint="pull the edges back to the target's (--refine)")
+        self._smooth = gui.add_checkbox("Smooth", False, hint=f"frames over {_SMOOTH_FRAMES} of them (--smooth)")
+        self._align = gui.add_checkbox(
+            "Align", False, hint="find how each mesh stands (--align)", visible=not self._transfers.finds_standing
+        )
+        self._force = gui.add_checkbox("Force", False, hint="pose even a person like an animal (--force)", visible=own)
+        self._project = gui.add_dropdown(
+            "Project", (_WITHOUT, "human", "animals"), hint="fit the target's rigid parts (--project)", visible=not own
+        )
+        axes = (_AS_FOUND, "X", "Y", "Z", "-X", "-Y", "-Z")
+        self._up = gui.add_dropdown("Up", axes, hint="where the heads of your meshes are (--up)")
+        self._front = gui.add_dropdown("Front", axes, hint="where your meshes face (--front)")
+        for handle in (self._refine, self._smooth, self._align, self._force, self._project, self._up, self._front):
+            handle.on_update(lambda _: self.ask())
+
+    def _add_result(self) -> None:
+        gui = self._client.gui
+        with gui.add_folder("Result"):
+            self._moving = gui.add_checkbox("Walk", False, hint="from one random pose to the next; frames are played")
+            self._errors = gui.add_checkbox("Error map", False, hint="known where both bodies are made up")
+            self._legend = gui.add_html("")
+            buttons = [gui.add_button(f"Download {kind}", icon=viser.Icon.DOWNLOAD) for kind in ("GLB", "OBJ")]
+            view = gui.add_button("Reset the view", icon=viser.Icon.VIEWFINDER, color="gray")
+        self._moving.on_update(lambda _: self.ask())
+        self._errors.on_update(lambda _: self._draw_again())
+        for suffix, button in zip((".glb", ".obj"), buttons, strict=True):
+            button.on_click(self._downloading(suffix))
+        view.on_click(lambda _: self._stage.reset())
+
+    def _switches(self) -> Switches:
+        up, front = (None if axis.value == _AS_FOUND else axis.value for axis in (self._up, self._front))
+        return Switches(
+            refine=self._refine.value,
+            align=self._align.value,
+            force=self._force.value,
+            project=None if self._project.value == _WITHOUT else self._project.value,
+            up=up,
+            front=front,
+            smooth=str(_SMOOTH_FRAMES) if self._smooth.value else "0",
+        )
+
+    def _downloading(self, suffix: str) -> Callable[[object], None]:
+        def download(_: object) -> None:
+            try:
+                name, content = self.session.result(suffix)
+            except DsffnetError as error:
+                self._client.add_notification("Nothing to download", self.session.plain(error), color="red")
+            else:
+                self._client.send_file_download(name, content, save_immediately=True)
+
+        return download
+
+    def _draw_again(self) -> None:
+        if self.session.outcome is not None:
+            frames = self.session.outcome.frames
+            self._draw(self.session.outcome, frames[self._frame % len(frames)])
+
+    def _draw(self, outcome: Outcome, frame: Posed) -> None:
+        with self._drawing, self._client.atomic():
+            sizes = {role: float(np.ptp(getattr(frame, role).vertices, axis=0).max()) for role in ("source", "target")}
+            self._stage.show("source", frame.source, unit=sizes["source"])
+            self._stage.show("target", frame.target, unit=sizes["target"])
+            errors = frame.errors if self._errors.value else None
+            worst = float(np.percentile(errors, 99)) if errors is not None else 1.0
+            self._stage.show("output", frame.output, unit=sizes["target"], errors=errors, worst=worst)
+            self._stage.say(
+                "output", "" if frame.pmd is None else f"PMD {frame.pmd / POINT_MESH_DISTANCE_SCALE:.2f}e-4"
+            )
+            self._legend.content = _legend(frame, worst, shown=errors is not None)
+
+    def _play(self) -> None:
+        """Show the frames of a sequence, one after the other; of a walk also backwards."""
+        while not self._closed.wait(1 / Switches.fps):
+            outcome = self.session.outcome
+            if outcome is None or len(outcome.frames) < 2:
+                continue
+            count, self._frame = len(outcome.frames), self._frame + 1
+            place = self._frame % count
+            if isinstance(outcome.asked.source, Figure):
+                place = abs((self._frame + count - 1) % (2 * count - 2) - (count - 1))
+            self._draw(outcome, outcome.frames[place])
+
+
+def _about(outcome: Outcome) -> str:
+    vertices = f"{len(outcome.file.mesh.vertices):,} vertices"
+    frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
+    lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
+    return "\n\n".join([*lines, *(f"⚠ {warning}" for warning in outcome.warnings)])
+
+
+def _legend(frame: Posed, worst: float, *, shown: bool) -> str:
+    """The bar of colours, and what PMD is."""
+    if frame.pmd is None:
+        words = "The truth is known, and an error map, where source and target are made-up bodies of one kind."
+        return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>' if shown else ""
+    if not shown:
+        return ""
+    ticks = "".join(f"<span>{100 * worst * share:.1f}</span>" for share in (0, 0.5, 1))
+    return (
+        '<div style="margin:4px 14px 10px;font-size:12px;color:#5d6676">'
+        f'<div style="height:9px;border-radius:3px;background:linear-gradient(90deg,{_BAR})"></div>'
+        f'<div style="display:flex;justify-content:space-between">{ticks}</div>'
+        "<div>distance of each vertex to the truth, in cm (the last: 99th percentile and above); PMD: mean square of "
+        "it in the truth's box, boxes centred alike</div></div>"
+    )

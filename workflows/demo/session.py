@@ -1,0 +1,115 @@
+"""What one person at the page has: a folder, and a transfer that follows what they choose."""
+
+import logging
+import re
+import shutil
+from collections import defaultdict
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Protocol
+
+from datagen.common.errors import DsffnetError, MeshError
+from datagen.common.printable import printable
+from datagen.common.resources import ran_out_of_memory
+from datagen.mesh.files import write_posed
+from datagen.mesh.sequences import write_animation
+from workflows.demo.newest import Newest
+from workflows.demo.transfers import Asked, Outcome, Transfers, read
+from workflows.demo.uploads import FRAME_LIMIT, keep
+
+log = logging.getLogger(__name__)
+
+
+class View(Protocol):
+    """What shows a session."""
+
+    def posing(self) -> None:
+        """A transfer has begun."""
+
+    def show(self, outcome: Outcome) -> None:
+        """A frame is done."""
+
+    def fail(self, message: str) -> None:
+        """A transfer, or an upload, cannot be."""
+
+
+class Session:
+    """One person's meshes, in a folder of their own that goes with them."""
+
+    def __init__(self, folder: Path, transfers: Transfers, view: View) -> None:
+        self._folder, self._transfers, self._view = folder, transfers, view
+        self.outcome: Outcome | None = None
+        self._uploads, self._kept = count(1), defaultdict[str, list[Path]](list)
+        folder.mkdir(parents=True)
+        self._newest = Newest(self._pose)
+
+    def ask(self, asked: Asked) -> None:
+        """Pose this next, in the place of what waits."""
+        self._newest.ask(asked)
+
+    def keep(self, role: str, name: str, content: bytes) -> tuple[Path, ...]:
+        """The files of an upload, ``source`` or ``target``, which are found to be meshes.
+
+        Raises
+        ------
+        DsffnetError
+            It is refused; what was uploaded before stays.
+        """
+        folder = self._folder / f"{role}-{next(self._uploads)}"
+        try:
+            files = keep(name, content, folder, most=1 if role == "target" else FRAME_LIMIT)
+            read(files[0])
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        self._kept[role].append(folder)
+        for former in self._kept[role][:-2]:  # the last one may be read at this moment
+            shutil.rmtree(former, ignore_errors=True)
+        return tuple(files)
+
+    def result(self, suffix: str) -> tuple[str, bytes]:
+        """The name and content of a file of the result; an animated GLB of several frames.
+
+        Raises
+        ------
+        MeshError
+            Nothing is posed yet.
+        """
+        outcome = self.outcome
+        if outcome is None:
+            raise MeshError("nothing is posed yet: choose a source and a target")
+        out = self._folder / "result" / f"{outcome.file.path.stem}-posed{suffix}"
+        frames = [frame.posed.vertices for frame in outcome.frames]
+        if len(frames) > 1 and suffix == ".glb":
+            write_animation(outcome.file, frames, out, frames_per_second=outcome.asked.switches.fps)
+        else:
+            out.parent.mkdir(exist_ok=True)
+            write_posed(outcome.file, frames[-1], out)
+        return out.name, out.read_bytes()
+
+    def close(self) -> None:
+        """End the work and remove the folder."""
+        self._newest.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _pose(self, asked: Asked, stale: Callable[[], bool]) -> None:
+        self._view.posing()
+        try:
+            self._transfers.run(asked, self._folder, stale, self._take)
+        except DsffnetError as error:
+            self._view.fail(self.plain(error))
+        except Exception as error:
+            log.warning("a transfer failed", exc_info=not ran_out_of_memory(error))
+            self._view.fail(
+                "memory ran out: decimate the meshes" if ran_out_of_memory(error) else f"it failed: {error!r}"
+            )
+
+    def _take(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self._view.show(outcome)
+
+    def plain(self, error: object) -> str:
+        """A message in which files are called by their names, not by where they lie."""
+        text = re.sub(rf"{re.escape(str(self._folder))}/([\w-]+/)?", "", str(error))
+        return printable(text.replace("look at --picture", "look at it"))

@@ -1,0 +1,222 @@
+"""One transfer for the page, by the functions of ``dsffnet transfer``: files in, what the page shows out."""
+
+import argparse
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from datagen.common.arrays import Floats
+from datagen.common.errors import MeshError
+from datagen.mesh.files import MeshFile, read_mesh_file, save_mesh
+from datagen.mesh.geometry import Mesh, bounding_box
+from training.inference.orientation import UPRIGHT, Axes
+from training.inference.standing import Standing
+from training.inference.transfer import PoseTransfer
+from training.objectives.metrics import recentred_point_mesh_distance
+from workflows.demo.bodies import PERSON, Figure, mesh_of, random_figure, truth_of, walk
+from workflows.demo.uploads import VERTEX_LIMIT
+from workflows.transfer.job import TransferJob
+from workflows.transfer.run import TransferWork
+
+Body = Figure | tuple[Path, ...]
+"""A made-up body, or the files of an upload: one mesh, or frames."""
+_ONE_AT_A_TIME = threading.Lock()  # so that two people wait for each other rather than both for twice as long
+
+
+@dataclass(frozen=True)
+class Switches:
+    """The options of ``dsffnet transfer``, named as there."""
+
+    refine: bool = False
+    align: bool = False
+    force: bool = False
+    project: str | None = None
+    up: str | None = None
+    front: str | None = None
+    smooth: str = "0"
+    fps: float = 15.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a person wants posed; ``moving``: frames, not one pose."""
+
+    source: Body
+    target: Body
+    switches: Switches = field(default_factory=Switches)
+    moving: bool = False
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A frame that is done.
+
+    ``source``, ``target`` and ``output`` stand with Y up, facing +Z; ``posed`` is the output in the target's own axes,
+    as it is written. ``truth`` is known of made-up bodies of one kind, and then the PMD (re-centred, in box^2) and
+    ``errors`` [v], the distances to it in the target's unit, boxes centred alike.
+    """
+
+    source: Mesh
+    target: Mesh
+    output: Mesh
+    posed: Mesh
+    truth: Mesh | None = None
+    errors: Floats | None = None
+    pmd: float | None = None
+
+
+@dataclass
+class Outcome:
+    """A transfer as far as it has come: frames, and how many there will be."""
+
+    asked: Asked
+    file: MeshFile
+    frames: list[Posed]
+    count: int
+    weights: str
+    warnings: list[str]
+    seconds: float = 0.0
+
+
+class _Remembering(PoseTransfer):
+    """Remembers how meshes stand, which takes longer to find than a pose to give."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__(network)
+        self._found = lru_cache(maxsize=32)(self._find)
+
+    def standing(self, vertices: Floats) -> Axes | Standing:
+        """As found the first time."""
+        return self._found(vertices.astype(np.float64).tobytes())
+
+    def _find(self, vertices: bytes) -> Axes | Standing:
+        return super().standing(np.frombuffer(vertices).reshape(-1, 3))
+
+
+class Transfers:
+    """Transfers by weights that stay loaded, shared by all who look at the page."""
+
+    def __init__(self, weights: Path | None) -> None:
+        """``weights``: None for those that come along and know the meshes."""
+        self.weights = weights
+        self._load = lru_cache(maxsize=4)(_Remembering.from_run)
+
+    @property
+    def finds_standing(self) -> bool:
+        """Whether the networks say how a mesh stands, so that it need not be asked to (``align``)."""
+        return self.weights is None or self._load(self.weights, project=None).finds_standing
+
+    def warm_up(self) -> None:
+        """Load what the first transfer needs, and make it."""
+        person = random_figure(PERSON, np.random.default_rng(0))
+        with tempfile.TemporaryDirectory() as folder:
+            self.run(Asked(person, person), Path(folder), lambda: False, lambda _: None)
+
+    def run(self, asked: Asked, folder: Path, stale: Callable[[], bool], show: Callable[[Outcome], None]) -> None:
+        """Pose; ``show`` is given the outcome after every frame, ``stale`` ends a sequence that nobody wants any more.
+
+        Raises
+        ------
+        DsffnetError
+            As ``dsffnet transfer``, and a mesh of more than VERTEX_LIMIT vertices.
+        """
+        sources = _files_of(asked.source, folder / "source", moving=asked.moving)
+        target = _files_of(asked.target, folder / "target", moving=False)[0]
+        job = _job(asked, sources, target, folder, named=self.weights is not None)
+        with _ONE_AT_A_TIME:
+            began = time.perf_counter()
+            for outcome in self._outcomes(asked, job):
+                outcome.seconds = time.perf_counter() - began
+                show(outcome)
+                if stale():
+                    break
+
+    def _outcomes(self, asked: Asked, job: TransferJob) -> Iterator[Outcome]:
+        first, target, warnings = read(job.sources[0]), read(job.target), list[str]()
+        work = TransferWork.of(
+            job, self.weights, first=first.mesh, target=target, force=asked.switches.force, load=self._load,
+            warn=warnings.append,
+        )  # fmt: skip
+        outcome = Outcome(asked, target, [], len(job.sources), work.by or str(self.weights), warnings)
+        figures = _figures(asked)
+        for number, posed in enumerate(work.posed()):
+            frame = _upright(read(job.sources[number]).mesh if number else first.mesh, target.mesh, posed, work.axes)
+            if figures and isinstance(asked.target, Figure):
+                frame = _measured(frame, truth_of(figures[number], asked.target))
+            outcome.frames.append(frame)
+            yield outcome
+
+
+def _figures(asked: Asked) -> list[Figure]:
+    if not isinstance(asked.source, Figure):
+        return []
+    return walk(asked.source) if asked.moving else [asked.source]
+
+
+def _files_of(body: Body, folder: Path, *, moving: bool) -> list[Path]:
+    """The files of a body; those of a figure are written, in the place of the last one's."""
+    if not isinstance(body, Figure):
+        if moving and len(body) == 1:
+            raise MeshError(f"{body[0].name} is one mesh: frames to play come as a .zip of mesh files")
+        return list(body) if moving else [body[0]]
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    figures = walk(body) if moving else [body]
+    places = [folder / f"{body.name}{f'-{number:03d}' if moving else ''}.ply" for number in range(len(figures))]
+    for figure, place in zip(figures, places, strict=True):
+        save_mesh(mesh_of(figure), place)
+    return places
+
+
+def read(path: Path) -> MeshFile:
+    """As ``dsffnet transfer`` reads it; MeshError also where it has more vertices than the page takes."""
+    file = read_mesh_file(path)
+    if len(file.mesh.vertices) > VERTEX_LIMIT:
+        raise MeshError(
+            f"{path} has {len(file.mesh.vertices):,} vertices, the page takes {VERTEX_LIMIT:,}: decimate it, or use "
+            "dsffnet transfer"
+        )
+    return file
+
+
+def _job(asked: Asked, sources: list[Path], target: Path, folder: Path, *, named: bool) -> TransferJob:
+    """The job of the command line that would do the same; ``named``: weights are."""
+    options = argparse.Namespace(
+        paths=[str(sources[0]), str(target)], source=None, target=None, out=folder / "posed.glb",
+        picture=False, viewer=False, source_geometry=(), target_geometry=(), model=named, **vars(asked.switches),
+    )  # fmt: skip
+    if all(isinstance(body, Figure) for body in (asked.source, asked.target)):
+        options.up, options.front = UPRIGHT.up, UPRIGHT.front  # how made-up bodies stand is known
+        options.align = False
+    if not asked.moving:
+        options.smooth = "0"
+        return TransferJob.from_options(options)
+    options.paths[0] = str(sources[0].parent)
+    return replace(TransferJob.from_options(options), sources=sources)
+
+
+def _upright(source: Mesh, target: Mesh, posed: Mesh, axes: tuple[Axes | Standing, Axes | Standing]) -> Posed:
+    ways = zip((axes[0], axes[1], axes[1]), (source, target, posed), strict=True)
+    stood = [Mesh(way.turned(mesh.vertices), mesh.faces) for way, mesh in ways]
+    return Posed(stood[0], stood[1], stood[2], posed)
+
+
+def _measured(frame: Posed, truth: Mesh | None) -> Posed:
+    """With the distances to the truth, both boxes centred alike."""
+    if truth is None:
+        return frame
+    box = bounding_box(truth.vertices)
+    right = truth.vertices - box.centre
+    ours = frame.posed.vertices - bounding_box(frame.posed.vertices).centre
+    boxed = [torch.from_numpy(np.asarray(mesh / box.half, np.float64))[None] for mesh in (ours, right)]
+    errors = np.linalg.norm(ours - right, axis=1)
+    return replace(frame, truth=truth, errors=errors, pmd=float(recentred_point_mesh_distance(*boxed)[0]))

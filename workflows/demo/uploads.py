@@ -1,0 +1,106 @@
+"""Files that a person sends to the page: what is taken, and the folder of the session in which they lie.
+
+A file gets a name of harmless letters in a folder of its own, whatever it was called, and is then read as
+``dsffnet transfer`` reads it. A zip holds the frames of a sequence, or a mesh with its materials and textures.
+"""
+
+import io
+import re
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+
+from datagen.common.errors import MeshError
+from datagen.common.printable import printable
+from datagen.mesh.formats import FORMATS
+from datagen.mesh.sequences import frames_of
+
+BYTE_LIMIT = 64 * 2**20
+"""Of one upload."""
+UNPACKED_LIMIT = 4 * BYTE_LIMIT
+FRAME_LIMIT = 240
+VERTEX_LIMIT = 100_000
+"""Of a mesh on the page; ``dsffnet transfer`` takes more."""
+ACCEPTED = ",".join((*FORMATS, ".zip"))
+_BESIDE = (".mtl", ".png", ".jpg", ".jpeg")  # of an OBJ or PLY
+_LONGEST_NAME = 60
+
+
+def require_size(name: str, size: int) -> None:
+    """Refuse an upload by the size that is announced.
+
+    Raises
+    ------
+    MeshError
+        It is too large.
+    """
+    if size > BYTE_LIMIT:
+        raise MeshError(
+            f"{printable(name)} has {size / 2**20:,.0f} MB, the page takes {BYTE_LIMIT // 2**20}: decimate it, or use "
+            "dsffnet transfer"
+        )
+
+
+def keep(name: str, content: bytes, folder: Path, *, most: int = FRAME_LIMIT) -> list[Path]:
+    """Write an upload into a folder that is not there yet; its mesh files, at most ``most``, in their order.
+
+    Raises
+    ------
+    MeshError
+        It is too large, of an unknown format, or a zip that holds no meshes, too many, or too much.
+    """
+    require_size(name, len(content))
+    suffix = _suffix(name)
+    if suffix not in (*FORMATS, ".zip"):
+        raise MeshError(f"{printable(name)} is none of {', '.join(FORMATS)}, nor a .zip of such frames")
+    files = _unpacked(name, content, most) if suffix == ".zip" else {_harmless(name): content}
+    folder.mkdir(parents=True)
+    for harmless, its in files.items():
+        (folder / harmless).write_bytes(its)
+    return frames_of(folder)
+
+
+def _unpacked(name: str, content: bytes, most: int) -> dict[str, bytes]:
+    """Meshes, materials and textures of a zip by name, without its folders."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            wanted = [entry for entry in archive.infolist() if _is_wanted(entry)]
+            _require_few(name, wanted, most)
+            files = {_harmless(entry.filename): archive.read(entry) for entry in wanted}
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError, EOFError, ValueError) as error:
+        raise MeshError(f"{printable(name)} cannot be read as a zip: {error}") from error
+    if len(files) < len(wanted):
+        raise MeshError(f"{printable(name)} holds two files of one name; frames need names of their own")
+    return files
+
+
+def _is_wanted(entry: zipfile.ZipInfo) -> bool:
+    path = PurePosixPath(entry.filename)
+    is_hidden = path.name.startswith(".") or "__MACOSX" in path.parts
+    return not entry.is_dir() and not is_hidden and _suffix(path.name) in (*FORMATS, *_BESIDE)
+
+
+def _require_few(name: str, entries: list[zipfile.ZipInfo], most: int) -> None:
+    """Refuse by what the zip says of itself; no more than it says is ever unpacked."""
+    meshes = sum(_suffix(entry.filename) in FORMATS for entry in entries)
+    size = sum(entry.file_size for entry in entries)
+    if not meshes:
+        raise MeshError(f"{printable(name)} holds no mesh files ({', '.join(FORMATS)})")
+    if meshes > most or len(entries) > 2 * FRAME_LIMIT:
+        raise MeshError(f"{printable(name)} holds {meshes:,} meshes, {most:,} can be taken here: use dsffnet transfer")
+    if size > UNPACKED_LIMIT:
+        raise MeshError(
+            f"{printable(name)} holds {size / 2**20:,.0f} MB, the page takes {UNPACKED_LIMIT // 2**20}: use dsffnet "
+            "transfer"
+        )
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(name).suffix.lower()
+
+
+def _harmless(name: str) -> str:
+    """A file's own name, without folders and of few letters."""
+    last = PurePosixPath(name.replace("\\", "/")).name
+    stem = re.sub(r"[^\w.-]+", "_", PurePosixPath(last).stem, flags=re.ASCII).lstrip(".-")
+    return f"{stem[-_LONGEST_NAME:] or 'mesh'}{_suffix(last)}"
