@@ -76,7 +76,7 @@ class Page:
         """Say what cannot be done; what is shown stays."""
         self._stage.say("output")
         self._progress.visible = False
-        self._status.content = "nothing was posed"
+        self._status.content = f"**Not posed.** {message}"
         self._client.add_notification("That cannot be posed", message, color="red", auto_close_seconds=20)
 
     def close(self) -> None:

@@ -50,6 +50,7 @@ class Stage:
         self._client = client
         client.scene.set_up_direction("+y")
         client.scene.configure_environment_map("studio", environment_intensity=0.35)
+        client.scene.configure_default_lights(cast_shadow=False)  # they cost a weak graphics card most of its time
         self._shown = {role: self._placed(role) for role in ROLES}
         self._fitted = (0.0, 0.0, 0.0)
         self._azimuth = _TURNED
