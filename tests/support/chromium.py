@@ -36,7 +36,7 @@ class Browser:
         """The answer to one DevTools command; the addresses that pages ask for meanwhile are noted."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
-        while (said := json.loads(self._socket.recv(timeout=120))).get("id") != number:
+        while (said := json.loads(self._socket.recv(timeout=300))).get("id") != number:
             if said.get("method") == "Network.requestWillBeSent":
                 self.requests.append(said["params"]["request"]["url"])
         assert "error" not in said, said

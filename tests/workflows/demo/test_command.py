@@ -1,0 +1,32 @@
+"""``dsffnet demo`` before any page: a port that is taken, and a command line that stays light."""
+
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from workflows.cli import main as cli
+
+
+def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["demo", "--port", str(port)])
+    said = capsys.readouterr().err
+    assert ended.value.code == 1 and said.count("\n") == 1
+    assert f"port {port} of 127.0.0.1 cannot be used" in said and f"dsffnet demo --port {port + 1}" in said
+
+
+def test_weights_that_are_not_there_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["demo", "--port", "0", "--model", "no-such-run"])
+    assert "these come along: animals" in capsys.readouterr().err
+
+
+def test_other_commands_do_not_import_it() -> None:
+    look = "import sys; from workflows.cli.main import parsed; parsed(['demo']); print('viser' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "False\n"
