@@ -14,8 +14,7 @@ from datagen.bodies import BodyModel, load_body
 from datagen.characters import cc0_animals
 from datagen.mesh.geometry import Mesh, standing_point
 from datagen.poses import Poses, draw_poses
-from datagen.recipe import AnnyBody, ClipPoses, NptPoses, PoseRecipe, RiggedBody
-from datagen.recipe.bodies import AnnyTopology
+from datagen.recipe import AnnyBody, AnnyTopology, ClipPoses, NptPoses, PoseRecipe, RiggedBody
 
 PERSON, ANIMAL = "person", "animal"
 LAST_POSE = 200
