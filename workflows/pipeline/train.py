@@ -53,6 +53,8 @@ def train_model(
     dataset = open_dataset(data)
     check_run_accepts(recipe, dataset, run.path)
     parameters = recipe.model_dump(mode="json")
+    if parent:
+        update_record(parent, dataset=about_dataset(dataset))  # the whole names it from now on
     with run.alone(), recorded(run.path, kind="train", name=name, parent=parent, parameters=parameters):
         begin_run(recipe, dataset, run)
         per_epoch, placed = order_of(recipe, dataset).steps_per_epoch, tasks.training(recipe)

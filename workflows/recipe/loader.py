@@ -138,8 +138,8 @@ def recipe_faults(where: str) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        is_whole = error.title == WorkflowRecipe.__name__
-        faults = faults_text(error, lambda fault: _describe(fault, is_whole=is_whole))
+        listed: set[str] | None = set() if error.title == WorkflowRecipe.__name__ else None
+        faults = faults_text(error, lambda fault: _describe(fault, listed))
         raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help-all") from error
 
 
@@ -210,7 +210,8 @@ def _find(name_or_file: str) -> Path | dict[str, Any]:
     raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
 
 
-def _describe(fault: Any, *, is_whole: bool) -> str:
+def _describe(fault: Any, listed: set[str] | None) -> str:
+    """One fault in words; of an unknown key with the keys of its section, unless these are ``listed`` (None: never)."""
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
     parts = zip(["", *location], location, strict=False)
@@ -221,11 +222,15 @@ def _describe(fault: Any, *, is_whole: bool) -> str:
             known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
         if key in known:
             return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
-        return f"unknown key {shown(key)}{nearest(key, known)}{_its_keys(location, key) if is_whole else ''}"
+        section, keys = key.rpartition(".")[0], ""
+        if listed is not None and section not in listed:
+            listed.add(section)
+            keys = _its_keys(location, section)
+        return f"unknown key {shown(key)}{nearest(key, known)}{keys}"
     return fault_text(fault, key=key)
 
 
-def _its_keys(location: list[str], key: str) -> str:
+def _its_keys(location: list[str], section: str) -> str:
     """Words that list the keys of the section of an unknown key, of the kind that was chosen; ``location`` names it."""
     models: list[type[BaseModel]] = [WorkflowRecipe]
     for part in location[:-1]:
@@ -234,7 +239,7 @@ def _its_keys(location: list[str], key: str) -> str:
         inner = [kind for field in fields for kind in _parts(field.annotation) if hasattr(kind, "model_fields")]
         models = chosen or inner or models
     keys = dict.fromkeys(name for model in models for name in model.model_fields)
-    return f" ({key.rpartition('.')[0] or 'a recipe'} has {', '.join(keys)})"
+    return f" ({section or 'a recipe'} has {', '.join(keys)})"
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
