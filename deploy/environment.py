@@ -20,8 +20,8 @@ from pathlib import Path
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 VENV = Path(".venv")
 WHAT = ["--constraint", "constraints.txt", "--editable", ".[dev]", "--requirement", "deploy/requirements.txt"]
-_SIZE = re.compile(r"^ *Downloading (\S+) \(([\d.]+) (kB|MB|GB)\)")
-_MEGABYTES = {"kB": 0.001, "MB": 1.0, "GB": 1000.0}
+_SIZE = re.compile(r"^ *Downloading (?!\S+\.metadata )(\S+) \(([\d.]+) ?([kKMG]i?B)\)")  # pip: (4.3 MB), uv: (4.3MiB)
+_MEGABYTES = {"kB": 1e-3, "KiB": 1.024e-3, "MB": 1.0, "MiB": 1.048576, "GB": 1e3, "GiB": 1073.741824}
 
 
 def main() -> int:
@@ -29,7 +29,9 @@ def main() -> int:
     began, python = time.monotonic(), VENV / "bin" / "python"
     if not (VENV / ".ready").exists():
         say(f"making .venv with Python {platform.python_version()} and the packages of constraints.txt")
-        subprocess.run([sys.executable, "-m", "venv", "--clear", str(VENV)], check=True)
+        if subprocess.run([sys.executable, "-m", "venv", "--clear", str(VENV)], check=False).returncode:
+            say(f"{sys.executable} makes no virtual environment; on Debian and Ubuntu install python3-venv")
+            return 1
     (VENV / ".ready").unlink(missing_ok=True)
     command = installer(python)
     status = followed(command)
@@ -71,7 +73,7 @@ def has_own_indexes(python: Path) -> bool:
 
 
 def cpu_index() -> str:
-    """PyTorch's index of CPU builds, where there is no GPU, they are needed and it answers; else nothing."""
+    """PyTorch's index of CPU builds, on Linux without a GPU, if it answers; else nothing."""
     if sys.platform != "linux" or shutil.which("nvidia-smi"):
         return ""
     try:
@@ -114,6 +116,8 @@ class Progress:
                 self._last = f"fetching {found[1].rpartition('/')[2]} ({found[2]} {found[3]})"
             elif line.startswith("Installing collected packages"):
                 self._last = f"installing {line.count(',') + 1} packages"
+            elif line.startswith(("Resolved ", "Prepared ", "Installed ")):  # uv
+                self._last = line.strip()
             yield line
 
     def end(self) -> None:

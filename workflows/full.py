@@ -44,7 +44,7 @@ from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
-from workflows.pipeline.stage import Stage, once, recorded, run_stage
+from workflows.pipeline.stage import Stage, mark_of, once, recorded, run_stage
 from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import is_trained, refuse_conflicts, train_model
 from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
             folder.remove()
         with Mirror(out, server):
             run_workflow(recipe, out, TaskRunner(local=options.local))
-            print_text(closing_words(folder, server))
+            print_text(closing_words(folder, server, beside=recipe.beside is not None))
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
@@ -119,11 +119,15 @@ def _training_stage(
     model: str,
     training: TrainingRecipe,
 ) -> Stage:
+    def work() -> None:
+        train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model)
+        mark_of(folder.path, "evaluate").unlink(missing_ok=True)  # an evaluation does not lie within what is beside it
+
     return Stage(
         name,
         depends_on=[data.model_dump(mode="json"), training.model_dump(mode="json")],
         intact=lambda: is_trained(training, folder.data, run.path) and has_record(run.path),
-        work=lambda: train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model),
+        work=work,
     )
 
 
@@ -161,13 +165,13 @@ def _report(out: Path) -> None:
     update_record(out, artifacts=[*NAMES, *(name for name in record.artifacts if name not in NAMES)])
 
 
-def closing_words(folder: SingleRunFolder, server: Server) -> str:
+def closing_words(folder: SingleRunFolder, server: Server, *, beside: bool = False) -> str:
     """The table, where everything lies, and what to try next."""
     out = folder.path
     table = read_text_within(folder.run.evaluation.path, "tables.md")
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-    run, beside = (shlex.quote(str(shown / each.path.name)) for each in (folder.run, folder.beside))
-    runs = f"{run}, and beside it {beside}" if has_record(folder.beside.path) else run
+    run, other = (shlex.quote(str(shown / each.path.name)) for each in (folder.run, folder.beside))
+    runs = f"{run}, and beside it {other}" if beside else run
     here = shown / "run" / "evaluation"
     meshes = shlex.quote(str(here / "meshes"))
     programs = _programs()

@@ -62,7 +62,11 @@ def test_what_pip_was_told_is_read_from_pip(name: str, own: bool, tmp_path: Path
 
 
 def test_what_is_fetched_is_said_every_few_seconds(environment: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = ["Collecting a\n", "  Downloading https://x.example/a-1-py3.whl (1.5 MB)\n", "Downloading b.whl (500 kB)\n"]
+    lines = [
+        "  Downloading https://x.example/a-1.whl.metadata (3 kB)\n",
+        "  Downloading https://x.example/a-1-py3.whl (1.5 MB)\n",
+        "Downloading b (512.0KiB)\n",
+    ]
     progress = environment.Progress(every=0.05)
 
     def slowly() -> Iterator[str]:
@@ -82,7 +86,9 @@ def test_an_environment_is_ready_only_when_all_was_installed(
     status: int, environment: ModuleType, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     command = [sys.executable, "-c", f"print('No matching distribution'); raise SystemExit({status})"]
-    monkeypatch.setattr(environment.subprocess, "run", lambda *_, **__: None)  # no venv is made
+    monkeypatch.setattr(
+        environment.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0)
+    )  # no venv is made
     monkeypatch.setattr(environment, "installer", lambda python: command)
     monkeypatch.setattr(environment, "by_pip", lambda python: command)
     Path(".venv").mkdir()

@@ -1,5 +1,6 @@
 """A workflow whose recipe has a training ``beside`` the first: both in one table, one picture, one report."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,10 @@ def test_both_are_trained_and_measured_on_the_same_triples(tmp_path: Path, capsy
     full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
     said = capsys.readouterr().out
     assert all(f"{stage}: skipped" in said for stage in ("generate", "train", "train-beside", "evaluate", "report"))
+    shutil.rmtree(folder.beside.path)
+    full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
+    said = capsys.readouterr().out
+    assert "train: skipped" in said and "evaluate: finished" in said, "what it was measured on is new"
 
 
 def test_its_keys_are_those_of_training() -> None:
@@ -51,6 +56,8 @@ def test_its_keys_are_those_of_training() -> None:
     recipe = load_recipe("smoke", words)
     assert recipe.beside is not None and (recipe.beside.network.name, recipe.beside.steps) == ("npt", 7)
     assert load_recipe("quickstart", ["beside=null"]).beside is None
+    named = load_recipe("smoke", ["beside=npt-paper"]).beside
+    assert named is not None and named == load_recipe("smoke", ["training=npt-paper"]).training
     with pytest.raises(RecipeError, match=r"unknown key 'beside.stepz', did you mean 'beside.steps'\?"):
         load_recipe("smoke", ["beside.stepz=7"])
     with pytest.raises(RecipeError, match=r"beside.early_stopping goes by .*beside.early_stopping=null"):

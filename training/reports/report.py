@@ -122,7 +122,7 @@ def workflow_report(out: Path) -> tuple[Path, Path]:
         *(Section(f"Training{_of(name, runs)}", _curves(run)) for name, run in runs.items()),
         dataset_card(dataset, picture=out / "generate" / "contact-sheet.png"),
         *(_card(name, runs, dataset, rows) for name in runs),
-        _files(out),
+        _files(out, but=() if len(runs) > 1 else ("beside",)),
     ]
     sections = [section for section in sections if section.body]
     return write_report(out, title=_title(record.name, dataset), lead=_lead(runs, dataset, rows), sections=sections)
@@ -229,7 +229,7 @@ def _lead(runs: Mapping[str, Path], dataset: Dataset, rows: list[Row]) -> str:
     )
 
 
-def _files(out: Path) -> Section:
+def _files(out: Path, *, but: Sequence[str]) -> Section:
     names = {
         "dataset.zarr": "the dataset",
         "run": "the training run: name this folder where a model is asked for",
@@ -241,6 +241,6 @@ def _files(out: Path) -> Section:
         "run/evaluation/meshes": "the examples as GLB files",
         "recipe.yaml": "the whole recipe",
     }
-    lines = [[path, what] for path, what in names.items() if (out / path).exists()]
+    lines = [[path, what] for path, what in names.items() if path not in but and (out / path).exists()]
     words = f"Beside this report, in {plain(shown(out))}:"
     return Section("Files", (Text(words), Table([["path", "what it is"], *lines])))

@@ -38,7 +38,7 @@ class Stage:
 
 def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
     """Do a stage, after ``before``, unless it is done; returns whether it was done now."""
-    mark = out / "stages" / f"{stage.name}.json"
+    mark = mark_of(out, stage.name)
     if _done(mark, stage) and stage.intact():
         say(f"{stage.name}: skipped, finished before")
         return False
@@ -50,6 +50,11 @@ def run_stage(stage: Stage, *, out: Path, before: Callable[[], None]) -> bool:
     write_atomically(mark, json.dumps({"fingerprint": stage.fingerprint, "seconds": seconds}).encode())
     say(f"{stage.name}: finished in {seconds:.0f} s")
     return True
+
+
+def mark_of(out: Path, stage: str) -> Path:
+    """The file that says that a stage was finished, and with what fingerprint."""
+    return out / "stages" / f"{stage}.json"
 
 
 @contextmanager

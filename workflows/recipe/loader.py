@@ -101,6 +101,8 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
     here = Path.cwd()
     words = [(key, with_absolute_paths({(last := key.rsplit(".", 1)[-1]): value}, here)[last]) for key, value in words]
     values = changed(values, words, kinds=(*_KINDS, ("beside.network", "name", DEFAULT_NETWORK)))
+    if isinstance(values.get("beside"), str):
+        values["beside"] = named_training(values["beside"])
     if not values:
         raise RecipeError(f"recipe {where} {_NO_SECTIONS}")
     with recipe_faults(where):
