@@ -52,7 +52,7 @@ def picture(path: Path) -> None:
             posed = model.vertices(parameters, poses)
             rows.append(Row(f"{outfit}\n{name}", [Panel(Mesh(standing(one), faces), colors) for one in posed]))
             print(outfit, name, flush=True)
-    title = "Every outfit in four poses, draped, on an adult, a child and an old woman"
+    title = "Every outfit in four poses, draped, on an adult, a child and an old person"
     mesh_grid(rows, path, columns=list(_SHOWN), title=title, one_scale=False, size=(230, 250))
 
 

@@ -45,10 +45,11 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
     topologies = _Topologies(recipe, body)
-    numbers = [topologies.number_of(identity, its) for identity, its in enumerate(parameters)]
+    table, numbers, rig_numbers = RigTable(), [], []
+    for identity, its in enumerate(parameters):  # all of a person at once, who may be dear to make
+        numbers.append(topologies.number_of(identity, its))
+        rig_numbers.append(table.add(body.rig(its, source.joints)))
     labelled = {"labelled": list(topologies.labels)} if topologies.labels else {}
-    table = RigTable()
-    rig_numbers = [table.add(body.rig(its, source.joints)) for its in parameters]
     return Plan(
         attributes={**_attributes(recipe, body, source), "rigs": table.parts, **labelled},
         provenance={

@@ -157,7 +157,7 @@ class Figure:
 
 
 def covered(figure: Figure, outfit: Sequence[GarmentPart]) -> NDArray[np.bool_]:
-    """Whether each vertex [vertex] of a body lies under an outfit, further than 3 cm from every hem.
+    """Whether each vertex [vertex] of a body lies under an outfit, further than 8 cm from every hem.
 
     Skirts cover nothing: one can look under them.
     """
@@ -210,6 +210,11 @@ def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide
     off = max(ease * part.ease * scale, distance)
     pinned = np.zeros(len(vertices), bool)
     pinned[_pins(figure, part, finest, vertices)] = True
+    if not pinned.any():
+        raise BodyError(
+            f"part {number + 1} of the outfit ({part.group}) hangs on nothing: pins is [{', '.join(part.pins)}]. Add "
+            "top, hem, or sleeves where it has a sleeve"
+        )
     return Garment(
         rest=Rest(
             np.round((vertices + off * vertex_normals(vertices, finest.faces)) * _GRID) / _GRID,
@@ -241,7 +246,14 @@ def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
                 f"{'none' if part.high is None else format(part.high, 'g')}) leaves nothing of the group. Levels are 0 "
                 "ankle, 1 knee, 2 hip, 3 waist, 4 neck; the skirt ends at 2.9: choose a low below a high"
             )
-    return surface.largest_piece()
+    pieces = surface.pieces()
+    if len(pieces) > 1:
+        raise BodyError(
+            f"part {number + 1} of the outfit ({part.group}, low {part.low:g}, high "
+            f"{'none' if part.high is None else format(part.high, 'g')}) falls into {len(pieces)} pieces, such as two "
+            "legs without a waist. Let high reach above the hip (2), or make it without"
+        )
+    return pieces[0]
 
 
 def _in_front(middles: NDArray[np.float64]) -> NDArray[np.bool_]:

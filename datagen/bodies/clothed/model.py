@@ -1,5 +1,6 @@
 """People of Anny in clothes: the skin that shows, then the parts of an outfit, draped over the person in every pose."""
 
+import importlib.metadata
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -12,10 +13,13 @@ from datagen.bodies import load_body
 from datagen.bodies.anny.model import AnnyModel
 from datagen.bodies.clothed.garments import BODY_VERTICES, Figure, Garment, covered, garment_of, helper_quads
 from datagen.bodies.skinning import Rest, rig_of, skin
+from datagen.common.assets import Asset
 from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody
 
+DRAPING = "1"
+"""To be raised with any change of outfits, cuts or draping that changes bytes: data of two kinds must not mix."""
 _GRID = 2.0**20
 
 
@@ -58,7 +62,9 @@ class ClothedModel:
         self._recipe = recipe
         self._shown, self._whole = _anny(recipe.body), _anny(recipe.body.model_copy(update={"topology": "makehuman"}))
         self.parameter_names = (*self._shown.parameter_names, "outfit", "ease")
-        self.joints, self.assets = self._shown.joints, self._shown.assets
+        self.joints = self._shown.joints
+        warp = Asset("warp-lang", "Apache-2.0", importlib.metadata.version("warp-lang"))
+        self.assets = (*self._shown.assets, warp, Asset("outfits and draping", "Apache-2.0", DRAPING))
         joints = self._whole.bones.joints
         self._joints = {joint: joints.index(joint) for joint in joints if joint}
         self.person = lru_cache(maxsize=4)(self._person)

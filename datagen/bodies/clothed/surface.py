@@ -31,13 +31,14 @@ class Surface:
         used, renumbered = np.unique(self.faces[faces], return_inverse=True)
         return Surface(renumbered.reshape(-1, 3), self.origin[used])
 
-    def largest_piece(self) -> "Surface":
-        """The connected piece that has most faces."""
+    def pieces(self) -> list["Surface"]:
+        """The connected pieces, but for crumbs of less than a tenth of the faces of the largest."""
         first, second, third = self.faces.T
         ends = np.concatenate([first, second]), np.concatenate([second, third])
         links = scipy.sparse.coo_array((np.ones(len(ends[0])), ends), shape=(self.origin.shape[0],) * 2)
         pieces = scipy.sparse.csgraph.connected_components(links, directed=False)[1][first]
-        return self.keep(pieces == np.bincount(pieces).argmax())
+        sizes = np.bincount(pieces)
+        return [self.keep(pieces == piece) for piece in np.flatnonzero(10 * sizes >= sizes.max())]
 
 
 def surface_of(quads: NDArray[np.int64], sources: int) -> Surface:

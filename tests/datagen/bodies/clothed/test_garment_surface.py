@@ -39,7 +39,7 @@ def test_a_slanting_cut_of_a_cut_has_one_border_and_every_edge_at_most_two_faces
         np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]]), axis=1
     )
     assert np.unique(sides, axis=0, return_counts=True)[1].max() == 2
-    assert len(borders(surface.faces)) == 1 and len(surface.largest_piece().faces) == len(surface.faces)
+    assert len(borders(surface.faces)) == 1 and [len(its.faces) for its in surface.pieces()] == [len(surface.faces)]
 
 
 def test_subdividing_keeps_the_surface_and_the_vertices_that_were_there() -> None:
@@ -51,9 +51,12 @@ def test_subdividing_keeps_the_surface_and_the_vertices_that_were_there() -> Non
     assert area(after.faces, after.of(places)) == pytest.approx(25)
 
 
-def test_the_largest_of_two_pieces_is_kept() -> None:
+def test_pieces_are_told_apart_and_crumbs_left_out() -> None:
     quads, places = sheet()
     whole = surface_of(quads, len(places))
     apart = whole.keep(np.abs(places[whole.faces][:, :, 0].mean(axis=1) - 1.5) > 0.5)
     assert len(borders(apart.faces)) == 2
-    assert area(apart.largest_piece().faces, apart.largest_piece().of(places)) == pytest.approx(15)
+    assert sorted(area(its.faces, its.of(places)) for its in apart.pieces()) == pytest.approx([5, 15])
+    middles = places[whole.faces].mean(axis=1)
+    crumb = whole.keep((middles[:, 0] > 2) | (middles[:, :2] < 1).all(axis=1))
+    assert [area(its.faces, its.of(places)) for its in crumb.pieces()] == pytest.approx([15])
