@@ -58,6 +58,8 @@ class Options:
     @property
     def weights(self) -> argparse.Namespace:
         """The options by which the command finds its weights."""
+        if not isinstance(self.model, str | os.PathLike | None):
+            raise RecipeError(f"model={self.model!r} is no path or name of weights")
         model = None if self.model is None else os.fspath(self.model)
         return argparse.Namespace(model=model, checkpoint="result", force=self.force, tracking_uri=None)
 
@@ -81,6 +83,9 @@ def posed(source: Any, target: Any, options: Options) -> PosedMesh:
 def _job(read: list[MeshFile], options: Options) -> TransferJob:
     if options.align and (options.up or options.front):
         raise RecipeError("align finds how the meshes stand; leave it out to say it by up and front")
+    for name, given in (("up", options.up), ("front", options.front)):
+        if not isinstance(given, str | None):
+            raise RecipeError(f"{name}={given!r} is no text; name an axis, as in {name}='Z', or two, 'SOURCE,TARGET'")
     return TransferJob(
         sources=[read[0].path],
         target=read[1].path,
@@ -105,13 +110,18 @@ def _mesh_file(given: Any, role: str) -> MeshFile:
 
 def _mesh(given: Any, role: str) -> Mesh:
     try:
-        vertices, faces = (given.vertices, given.faces) if hasattr(given, "vertices") else given
-        return Mesh(np.array(vertices, np.float64), np.array(faces, np.int64))
-    except (AttributeError, TypeError, ValueError) as error:
+        both = (given.vertices, given.faces) if hasattr(given, "vertices") else given
+        vertices, faces = (np.array(each) for each in both)
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # the last of a tensor with a gradient
         raise MeshError(
             f"{role} is a {type(given).__name__}; give a path, an object with vertices [n, 3] and faces [f, 3], or a "
             f"pair of these ({error})"
         ) from error
+    for what, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
+        if array.size and array.dtype.kind not in kinds:
+            wanted = "whole numbers" if what == "faces" else "real numbers"
+            raise MeshError(f"{role}: its {what} are {array.dtype}, not {wanted}")
+    return Mesh(vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False))
 
 
 class _InMemory(Alone):

@@ -23,6 +23,12 @@ def require_known_names(wanted: Sequence[str], there: Iterable[str], path: Path,
             raise MeshError(f"{path} has no {what} {name!r}; it has {listed(known) or 'none'}")
 
 
+def require_few(names: Sequence[str], path: Path) -> None:
+    """Refuse more than 1,000 geometries (MeshError), before anything is computed of each."""
+    if len(names) > _MOST:
+        raise MeshError(f"{path} holds {len(names):,} geometries: {listed(names)}. Choose with {CHOOSE}")
+
+
 def require_one_body(extents: Mapping[str, NDArray[np.float64]], path: Path) -> None:
     """Refuse geometries, by least and greatest coordinates [2, 3] of each, that do not make one body.
 
@@ -32,12 +38,10 @@ def require_one_body(extents: Mapping[str, NDArray[np.float64]], path: Path) -> 
     Raises
     ------
     MeshError
-        Some are apart from the others, one is the ground below them, or they are more than 1,000.
+        Some are apart from the others, or one is the ground below them.
     """
     if len(extents) < 2:
         return
-    if len(extents) > _MOST:
-        raise MeshError(f"{path} holds {len(extents):,} geometries: {listed(extents)}. Choose with {CHOOSE}")
     names, boxes = list(extents), np.array(list(extents.values()))
     apart = [name for name, is_near in zip(names, _together(boxes), strict=True) if not is_near]
     ground = [name for place, name in enumerate(names) if _is_ground(boxes, place)]

@@ -88,13 +88,15 @@ def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
     Raises
     ------
     MeshError
-        No vertices, no faces, coordinates that are not finite, faces that index nothing, or no extent.
+        No vertices, no triangles, coordinates that are not finite, faces that index nothing, or no extent.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) == 0:
         raise MeshError(f"{name} has no usable vertices (shape {vertices.shape})")
-    if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) == 0:
+    if faces.size == 0:
         raise MeshError(f"{name} has no faces (shape {faces.shape}); pose transfer needs a triangle mesh")
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"{name} has faces of shape {faces.shape}, not triangles [f, 3]: triangulate it")
     wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(wrong):
         raise MeshError(f"{name}: {len(wrong)} vertices are not finite, the first is number {wrong[0]}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from datagen.mesh.files import load_mesh, save_mesh
@@ -62,13 +63,26 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
         ((flat, good.faces), "target is flat: it has no thickness along z"),
         (tmp_path / "no.obj", "no.obj"),
         (7, "target is a int"),
+        ((torch.tensor(good.vertices, requires_grad=True), good.faces), "target is a tuple; .*requires grad"),
+        ((good.vertices + 1j, good.faces), "target: its vertices are complex128, not real numbers"),
+        ((good.vertices, good.faces + 0.5), "target: its faces are float64, not whole numbers"),
+        ((good.vertices, np.ones((4, 3), bool)), "target: its faces are bool, not whole numbers"),
+        ((good.vertices, np.zeros((5, 4), int)), r"target has faces of shape \(5, 4\), not triangles \[f, 3\]"),
+        ((good.vertices, []), "target has no faces"),
     ]
     for given, said in wrong:
         with pytest.raises(DsffnetError, match=said) as error:
             transfer(pose, given, model=run)
         assert "\n" not in str(error.value)
-    with pytest.raises(DsffnetError, match="no such run or weights"):
-        transfer(pose, pose, model=tmp_path / "no-run")
+    for model, said in (
+        (tmp_path / "no-run", "no such run or weights"),
+        ("", "'': there is no such run or weights"),
+        (5, "model=5 is no path or name of weights"),
+    ):
+        with pytest.raises(DsffnetError, match=said):
+            transfer(pose, pose, model=model)
+    with pytest.raises(DsffnetError, match=r"up=5 is no text; name an axis, as in up='Z'"):
+        transfer(pose, pose, model=run, up=5)
     with pytest.raises(DsffnetError, match="align finds how the meshes stand"):
         transfer(pose, pose, model=run, align=True, up="Z")
     with pytest.raises(DsffnetError, match="never written over"):

@@ -49,6 +49,9 @@ def test_both_are_trained_and_measured_on_the_same_triples(tmp_path: Path, capsy
     full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
     said = capsys.readouterr().out
     assert "train: skipped" in said and "evaluate: finished" in said, "what it was measured on is new"
+    other = recipe.model_copy(update={"beside": recipe.beside.model_copy(update={"steps": 3})})
+    with pytest.raises(RecipeError, match=r"beside was trained by another recipe \(beside.steps: 2 there, 3 here\)"):
+        full.run_workflow(other, tmp_path, TaskRunner(local=True))
 
 
 def test_its_keys_are_those_of_training() -> None:

@@ -88,8 +88,12 @@ def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | 
     )
 
 
-def require_same_training(recipe: TrainingRecipe, dataset: Dataset, run: Path, checkpoint: Checkpoint) -> None:
+def require_same_training(
+    recipe: TrainingRecipe, dataset: Dataset, run: Path, checkpoint: Checkpoint, *, section: str = "training"
+) -> None:
     """Raise if a run's checkpoint was trained by another recipe or on another dataset.
+
+    ``section``: where the recipe stands in its workflow's, for the message.
 
     Raises
     ------
@@ -99,6 +103,7 @@ def require_same_training(recipe: TrainingRecipe, dataset: Dataset, run: Path, c
     if checkpoint.dataset != dataset.uuid:
         raise CheckpointError(
             f"{run} was trained on dataset {checkpoint.dataset}, not on {dataset.url} ({dataset.uuid}). Choose another "
-            f"--out (begin there from these weights with --set training.start_from={run}), or add --fresh to start over"
+            f"--out (begin there from these weights with --set {section}.start_from={run}), or add --fresh to start "
+            "over"
         )
-    recipe.require_same_learning(recipe_of(checkpoint), where=str(run))
+    recipe.require_same_learning(recipe_of(checkpoint), where=str(run), section=section)

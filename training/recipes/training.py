@@ -272,8 +272,10 @@ class TrainingRecipe(Frozen):
             if is_set:
                 raise ValueError(f"network 'parts' knows no {field}: take it away")
 
-    def require_same_learning(self, other: "TrainingRecipe", *, where: str) -> None:
+    def require_same_learning(self, other: "TrainingRecipe", *, where: str, section: str = "training") -> None:
         """Raise if a run that is to be resumed was trained by another recipe.
+
+        ``section``: where this one stands in its workflow's, for the message.
 
         Raises
         ------
@@ -282,7 +284,7 @@ class TrainingRecipe(Frozen):
         """
         ignored = _HOW_IT_RUNS - (_WHEN_IT_STOPS if self.early_stopping else set())
         changed = [
-            f"training.{name}: {getattr(other, name)} there, {getattr(self, name)} here"
+            f"{section}.{name}: {getattr(other, name)} there, {getattr(self, name)} here"
             for name in type(self).model_fields
             if name not in ignored and _meant(getattr(self, name)) != _meant(getattr(other, name))
         ]

@@ -124,9 +124,9 @@ class _Publication:
         self._send_artifacts()
         if self.record.model and self.record.status == "FINISHED":
             self._once("model", self._register_model)
-            if self.record.model_about != self.sent.get("about", ""):
-                self._registration().describe(self.record.model, self.record.model_about)
-                self._note(about=self.record.model_about)
+            about = self.record.model_about
+            if about != self.sent.get("about", "") and self._registration().describe(self.record.model, about):
+                self._note(about=about)
         if self.record.status != self.sent.get("status"):
             self._send_status()
 
@@ -286,12 +286,17 @@ def _value(text: str) -> str:
 
 def _experiment(client: Any, server: Server, *, mark: bool = False) -> str:
     """The experiment's id; it is made where it is not there, and with ``mark`` gets the tags that it lacks."""
+    from mlflow.exceptions import MlflowException
+
     found = client.get_experiment_by_name(EXPERIMENT)
     if found is None:
         place = server.artifacts.as_uri() if server.artifacts else None
         return str(client.create_experiment(EXPERIMENT, place, tags=EXPERIMENT_TAGS))
     if mark:
-        mark_experiment(client, found)
+        try:
+            mark_experiment(client, found)
+        except MlflowException as error:  # of a shared server, where others alone may change it: runs are sent
+            log.debug("the experiment at %s keeps its tags: %s", server.uri, _first_line(error))
     return str(found.experiment_id)
 
 

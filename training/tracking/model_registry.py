@@ -41,12 +41,13 @@ class Registration:
             version = self._register_version(name, source, model)
         self.client.set_registered_model_alias(name, ALIAS, version)
 
-    def describe(self, name: str, about: str) -> None:
-        """Give the registered version its description: what is said about it, and how it is called."""
+    def describe(self, name: str, about: str) -> bool:
+        """Give the registered version, if there is one, its description: what is said of it, how it is called."""
         version = self._registered_version(name)
         if version is not None:
             text = f"{about}\n\n{how_to_call(f'models:/{name}/{version}')}"
             self.client.update_model_version(name, version, description=text)
+        return version is not None
 
     def _show_in(self, run: str, model: str) -> None:
         from mlflow.entities import LoggedModelOutput

@@ -14,7 +14,7 @@ from datagen.mesh.formats.surface import Image, Material, Surface, numbered
 _LARGEST = 1024  # pixels of a texture's side, as it is drawn
 _MOST_PIXELS = 2**26  # of one that is read at all
 _MOST_TEXTURES = 64  # of a mesh; the others leave base colours
-_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA")  # TIFF: libtiff writes its complaints to stderr
 _SEEN = 0.02  # difference of colours by which materials are told from grey, and from each other
 
 

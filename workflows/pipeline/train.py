@@ -145,10 +145,11 @@ def refuse_conflicts(recipe: DatasetRecipe, folder: WorkflowFolder, runs: Mappin
     if is_complete(folder.data):
         dataset = open_dataset(folder.data)
         for run, training in runs.items():
-            check_run_accepts(training, dataset, run)
+            section = "beside" if run == folder.path / "beside" else "training"  # as in a SingleRunFolder
+            check_run_accepts(training, dataset, run, section=section)
 
 
-def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
+def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path, *, section: str = "training") -> None:
     """Refuse a run that was trained by another recipe or on other data, before anything in it is touched.
 
     Raises
@@ -157,7 +158,7 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> No
         It did; the message says what differs.
     """
     if found := load_checkpoint(run):
-        require_same_training(recipe, dataset, run, found)
+        require_same_training(recipe, dataset, run, found, section=section)
 
 
 def is_trained(recipe: TrainingRecipe, data: str, run: Path) -> bool:

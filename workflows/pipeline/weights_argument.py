@@ -69,9 +69,11 @@ def weights_called(name: str, *, option: str) -> Path:
         There are none; what comes along is said.
     """
     place = weights_named(name)
-    if not place.exists():
+    if not name or not place.exists():
         known = ", ".join(own_names())
-        raise CheckpointError(f"{option} {name}: there is no such run or weights. Name one; these come along: {known}")
+        raise CheckpointError(
+            f"{option} {name or repr(name)}: there is no such run or weights. Name one; these come along: {known}"
+        )
     return place
 
 

@@ -21,7 +21,7 @@ from datagen.mesh.formats.glb_writer import Block, Draft, GlbParts, Json
 from datagen.mesh.formats.gltf import SOLID, Gltf, triangles
 from datagen.mesh.formats.gltf_materials import base_texture, image_bytes, read_material
 from datagen.mesh.formats.surface import Alone, Encoded, Format, Image, Surface, numbered, srgb, unit
-from datagen.mesh.geometries import require_known_names, require_one_body
+from datagen.mesh.geometries import require_few, require_known_names, require_one_body
 from datagen.mesh.limits import require_counts
 
 
@@ -43,6 +43,8 @@ def read_glb(path: Path, geometries: Sequence[str]) -> "GlbContent":
     require_known_names(geometries, nodes, path, what="geometry")
     shown = {name: node for name, node in nodes.items() if node in scene.shown and not _is_nothing(scene, node)}
     taken = {name: node for name, node in nodes.items() if name in geometries} or shown or nodes
+    if not geometries:
+        require_few(list(taken), path)
     content = GlbContent(scene, taken)
     if not geometries:
         require_one_body(content.extents, path)
@@ -91,7 +93,7 @@ class GlbContent(Alone):
     def __init__(self, file: Gltf, nodes: Mapping[str, int]) -> None:
         self.geometries = tuple(nodes)
         self.name: str | None = self.geometries[0] if len(nodes) == 1 else None
-        self._file, self._nodes = file, list(nodes.values())
+        self._file, self._nodes = file, {node: place for place, node in enumerate(nodes.values())}
         for name, node in nodes.items():
             if _is_nothing(file, node):
                 raise ValueError(f"node {name!r} is scaled to nothing: apply its scale and export it again")
@@ -107,13 +109,11 @@ class GlbContent(Alone):
     @property
     def extents(self) -> dict[str, NDArray[np.float64]]:
         """Least and greatest coordinates [2, 3] of each geometry that has vertices."""
-        found: dict[str, NDArray[np.float64]] = {}
-        for name, node in zip(self.geometries, self._nodes, strict=True):
-            own = [self.vertices[self._rows(piece)] for piece in self._firsts if piece.node == node]
-            if own:
-                both = np.concatenate(own)
-                found[name] = np.stack([both.min(axis=0), both.max(axis=0)])
-        return found
+        own: dict[str, list[NDArray[np.float64]]] = {}
+        for piece in self._firsts:
+            own.setdefault(self.geometries[self._nodes[piece.node]], []).append(self.vertices[self._rows(piece)])
+        joined = {name: np.concatenate(parts) for name, parts in own.items()}
+        return {name: np.stack([each.min(axis=0), each.max(axis=0)]) for name, each in joined.items()}
 
     def _rows(self, piece: Piece) -> slice:
         return slice(piece.start, piece.start + self._file.json["accessors"][piece.accessor[1]]["count"])
@@ -185,9 +185,9 @@ class GlbContent(Alone):
     def surface(self) -> Surface:
         """Triangles of all primitives, one after another, with their materials."""
         numbers = [piece.json.get("material", -1) for piece in self._pieces]
-        used = list(dict.fromkeys(number for number in numbers if number >= 0))
+        used = {number: place for place, number in enumerate(dict.fromkeys(n for n in numbers if n >= 0))}
         corners = np.concatenate([piece.start + piece.corners for piece in self._pieces])
-        of_piece = np.array([used.index(number) if number >= 0 else -1 for number in numbers], np.int64)
+        of_piece = np.array([used.get(number, -1) for number in numbers], np.int64)
         lengths = [len(piece.corners) // 3 for piece in self._pieces]
         return Surface(
             corners,
@@ -257,6 +257,7 @@ class GlbContent(Alone):
     @property
     def _lost(self) -> list[str]:
         others = {name: node for name, node in solid_nodes(self._file).items() if node not in self._nodes}
+        hidden = set(others.values())
         parts = {
             f"other geometries: {', '.join(others)}": others,
             "skins": self._file.json.get("skins"),
@@ -265,7 +266,7 @@ class GlbContent(Alone):
             "lines and points": any(
                 primitive.get("mode", 4) not in SOLID
                 for number, node in enumerate(self._file.nodes)
-                if "mesh" in node and number not in others.values()
+                if "mesh" in node and number not in hidden
                 for primitive in self._primitives(number)
             ),
         }
@@ -280,7 +281,10 @@ class GlbContent(Alone):
         parts = GlbParts({k: v for k, v in self._file.json.items() if k not in _REBUILT})
         copied: dict[int, int] = {}
         primitives = [self._primitive(piece, parts, copied) for piece in self._pieces]
-        parts.json["meshes"] = [self._own_mesh(node, primitives) for node in self._nodes]
+        own: dict[int, list[Json]] = {node: [] for node in self._nodes}
+        for piece, primitive in zip(self._pieces, primitives, strict=True):
+            own[piece.node].append(primitive)
+        parts.json["meshes"] = [self._own_mesh(node, its) for node, its in own.items()]
         parts.json["nodes"] = [self._stripped(number, node) for number, node in enumerate(self._file.nodes)]
         if "images" in self._file.json:
             parts.json["images"] = [self._copied_image(image, parts) for image in self._file.json["images"]]
@@ -291,10 +295,9 @@ class GlbContent(Alone):
         return Draft(parts, blocks, self.surface, np.arange(len(self.vertices)), self._group)
 
     def _own_mesh(self, node: int, primitives: list[Json]) -> Json:
-        """The mesh of a node, with its own ones of all primitives: one that several nodes share is posed for each."""
+        """The mesh of a node, with primitives of its own: one that several nodes share is posed for each."""
         mesh = self._file.json["meshes"][self._file.nodes[node]["mesh"]]
-        own = [new for piece, new in zip(self._pieces, primitives, strict=True) if piece.node == node]
-        return {k: v for k, v in mesh.items() if k not in ("weights", "extras")} | {"primitives": own}
+        return {k: v for k, v in mesh.items() if k not in ("weights", "extras")} | {"primitives": primitives}
 
     def _block(self, piece: Piece, primitives: list[Json]) -> Block:
         rows = self._rows(piece)
@@ -317,7 +320,7 @@ class GlbContent(Alone):
         return kept
 
     def _stripped(self, number: int, node: Json) -> Json:
-        mesh = {"mesh": self._nodes.index(number)} if number in self._nodes else {}
+        mesh = {"mesh": self._nodes[number]} if number in self._nodes else {}
         kept = {k: v for k, v in node.items() if k not in ("mesh", "skin", "weights", "extensions")}
         extensions = {k: v for k, v in node.get("extensions", {}).items() if k != "EXT_mesh_gpu_instancing"}
         return kept | mesh | ({"extensions": extensions} if extensions else {})

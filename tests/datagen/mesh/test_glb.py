@@ -9,6 +9,7 @@ import trimesh
 
 from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
+from datagen.mesh.formats import glb
 from datagen.mesh.formats.gltf import Gltf
 from datagen.mesh.sequences import write_animation
 from tests.support.shapes.mesh_files import FACES, PNG, POINTS, scene, sound
@@ -202,6 +203,14 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
     assert read_mesh_file(two(tmp_path, (1.6, 0, 0), trimesh.creation.box())).geometries == ("body", "other")
     with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
         read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box((9, 0, 9))))
+
+
+def test_too_many_geometries_are_refused_before_any_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    document = scene()
+    document.json |= {"nodes": [{"mesh": 0}] * 1001, "scenes": [{"nodes": list(range(1001))}]}
+    monkeypatch.setattr(glb, "GlbContent", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(MeshError, match=r"holds 1,001 geometries: .* and 989 more. Choose with --source-geometry"):
+        read_mesh_file(saved(document, tmp_path))
 
 
 @pytest.mark.parametrize(

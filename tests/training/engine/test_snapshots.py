@@ -83,13 +83,14 @@ def test_a_broken_network_is_drawn_as_it_is(batch: Batch, faces: np.ndarray, tmp
     assert (column(drawn(path), 0) < 200).any()
 
 
-def test_coefficients_are_drawn_a_panel_a_block(tmp_path: Path) -> None:
+@pytest.mark.parametrize("prefix", ["modulation/", ""], ids=["now", "of earlier journals"])
+def test_coefficients_are_drawn_a_panel_a_block(tmp_path: Path, prefix: str) -> None:
     journal = Journal(tmp_path / "metrics.jsonl")
     for step in range(0, 100, 10):
         places = [f"block{b}.norm{n}" for b in (1, 2, 3, 4) for n in (1, 2)]
-        names = [f"modulation/{kind}/{place}" for kind in ("alpha", "beta") for place in places]
+        names = [f"{prefix}{kind}/{place}" for kind in ("alpha", "beta") for place in places]
         journal.write(step, {name: np.sin(step / 30 + place) / 5 for place, name in enumerate(names)})
-    journal.write(100, {"loss/total": 1.0, "modulation/alpha/block1.norm1": float("nan")})
+    journal.write(100, {"loss/total": 1.0, f"{prefix}alpha/block1.norm1": float("nan")})
     journal.close()
     path = draw_coefficients(tmp_path, tmp_path / "figures" / "coefficients.png")
     assert path is not None

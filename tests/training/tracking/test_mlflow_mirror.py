@@ -11,6 +11,7 @@ from typing import Any
 import mlflow
 import numpy as np
 import pytest
+from mlflow.protos.databricks_pb2 import PERMISSION_DENIED
 
 from datagen.common.errors import TrackingError
 from datagen.mesh.geometry import Mesh
@@ -22,8 +23,10 @@ from training.inference.registered_model import download_weights
 from training.inference.transfer import PoseTransfer
 from training.tracking import mlflow_mirror as tracking
 from training.tracking.journal import Journal
+from training.tracking.mirror_state import read_sent
 from training.tracking.mlflow_mirror import Mirror, publish
 from training.tracking.mlflow_store import experiment_in
+from training.tracking.model_registry import Registration
 from training.tracking.record import (
     ALIAS,
     EXPERIMENT,
@@ -111,6 +114,31 @@ def test_the_experiment_is_shown_as_training_with_columns_of_pmd(root: Path, ser
     made = client.get_experiment_by_name(EXPERIMENT)
     assert made.tags["mlflow.experimentKind"] == "custom_model_development"
     assert experiment_in(server.artifacts.parent / "mlflow.db") == made.experiment_id
+
+
+def test_an_experiment_that_others_alone_may_change_gets_runs_all_the_same(
+    root: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise mlflow.exceptions.MlflowException("Permission denied", error_code=PERMISSION_DENIED)
+
+    mlflow.MlflowClient(server.uri).create_experiment(EXPERIMENT)
+    monkeypatch.setattr(mlflow.MlflowClient, "set_experiment_tag", refuse)
+    publish(root, server)
+    assert set(runs_of(server)) == {"quick", "train"}
+
+
+def test_a_description_is_noted_only_where_a_version_has_it(
+    root: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Registration, "register", lambda *_, **__: None)
+    update_record(root / "run", model="dsffnet", model_about="PMD 7.5e-4")
+    end_record(root / "run", "FINISHED")
+    publish(root, server)
+    assert "about" not in read_sent(root / "run", server.uri)
+    monkeypatch.setattr(Registration, "describe", lambda *_: True)
+    publish(root, server)
+    assert read_sent(root / "run", server.uri)["about"] == "PMD 7.5e-4"
 
 
 def artifacts_of(server: Server, run: Any, folder: str | None = None) -> set[str]:

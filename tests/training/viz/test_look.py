@@ -16,9 +16,9 @@ SQUARE = Surface(np.arange(4), np.array([4]), uvs=np.array([[0.0, 0], [1, 0], [1
 CAMERA = Camera((0.0, 1.0, 8.0), (0.0, 1.0, 0.0))
 
 
-def png(pixels: np.ndarray, mode: str = "RGB") -> Image:
+def png(pixels: np.ndarray, mode: str = "RGB", kind: str = "PNG") -> Image:
     file = io.BytesIO()
-    Pillow.fromarray(pixels.astype(np.uint8)).convert(mode).save(file, "PNG")
+    Pillow.fromarray(pixels.astype(np.uint8)).convert(mode).save(file, kind)
     return Image("skin.png", file.getvalue())
 
 
@@ -55,7 +55,8 @@ def test_colours_of_vertices_are_drawn() -> None:
 
 
 def test_a_texture_that_cannot_be_read_leaves_the_base_colour() -> None:
-    for content in (b"", b"\x89PNG broken", png(np.zeros((4, 4, 3))).content[:40]):
+    blue = np.full((4, 4, 3), BLUE)
+    for content in (b"", b"\x89PNG broken", png(blue).content[:40], png(blue, kind="TIFF").content):
         surface = textured(Image("skin.png", content), (0.0, 1.0, 0.0, 1.0))
         assert np.abs(drawn(surface) - GREEN).max() <= 3
 
