@@ -1,5 +1,6 @@
 """The controls by which a person chooses one body: a made-up person or animal by sliders, or a file."""
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from workflows.demo.bodies import (
 from workflows.demo.transfers import Body
 from workflows.demo.uploads import ACCEPTED, BYTE_LIMIT, FRAME_LIMIT
 
+log = logging.getLogger(__name__)
 KINDS = {"made-up person": PERSON, "made-up animal": ANIMAL}
 OWN = "my own mesh"
 _HINTS = {
@@ -140,6 +142,10 @@ class BodyControls:
             self._own = self._keep(file.name, file.content)
         except DsffnetError as error:
             self._failed(str(error))
+            return
+        except Exception as error:
+            log.warning("an upload failed", exc_info=True)
+            self._failed(f"it cannot be read: {error!r}")
             return
         frames = f", {len(self._own)} frames of at most {FRAME_LIMIT}" if len(self._own) > 1 else ""
         self._about.content = f"**{self._own[0].name}**{frames}. Another file takes its place."

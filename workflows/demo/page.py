@@ -15,7 +15,7 @@ from workflows.demo.bodies import PERSON, Figure, random_figure
 from workflows.demo.controls import BodyControls
 from workflows.demo.session import Session
 from workflows.demo.stage import Stage
-from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers
+from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers, clash_of
 
 _STYLE = """<style>
 input[type=file] { display: block !important; width: calc(100% - 20px); margin: 0 10px 6px; padding: 14px 10px;
@@ -54,6 +54,10 @@ class Page:
         """Pose what the controls say."""
         source, target = self._source.body(), self._target.body()
         if source is None or target is None:
+            return
+        clash = clash_of(source, target, self._switches())
+        if clash:
+            self._status.content = f"**Up and Front.** {clash}"
             return
         moving = self._moving.value or (not isinstance(source, Figure) and len(source) > 1)
         self.session.ask(Asked(source, target, self._switches(), moving=moving))
@@ -153,11 +157,13 @@ class Page:
     def _downloading(self, suffix: str) -> Callable[[object], None]:
         def download(_: object) -> None:
             try:
-                name, content = self.session.result(suffix)
+                result = self.session.result(suffix)
             except DsffnetError as error:
                 self._client.add_notification("Nothing to download", self.session.plain(error), color="red")
             else:
-                self._client.send_file_download(name, content, save_immediately=True)
+                self._client.send_file_download(result.name, result.content, save_immediately=True)
+                if result.left_out:
+                    self._client.add_notification("Left out", "\n".join(result.left_out), color="yellow")
 
         return download
 

@@ -1,13 +1,17 @@
 """What one person at the page has: a folder, and a transfer that follows what they choose."""
 
+import io
 import logging
 import re
 import shutil
+import tempfile
+import threading
+import zipfile
 from collections import defaultdict
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from datagen.common.errors import DsffnetError, MeshError
 from datagen.common.printable import printable
@@ -34,6 +38,14 @@ class View(Protocol):
         """A transfer, or an upload, cannot be."""
 
 
+class Result(NamedTuple):
+    """A file to download, and what it could not hold, a line each."""
+
+    name: str
+    content: bytes
+    left_out: list[str]
+
+
 class Session:
     """One person's meshes, in a folder of their own that goes with them."""
 
@@ -41,6 +53,7 @@ class Session:
         self._folder, self._transfers, self._view = folder, transfers, view
         self.outcome: Outcome | None = None
         self._uploads, self._kept = count(1), defaultdict[str, list[Path]](list)
+        self._here = threading.Lock()  # held where the folder is written in, so that nothing comes after its end
         folder.mkdir(parents=True)
         self._newest = Newest(self._pose)
 
@@ -56,6 +69,11 @@ class Session:
         DsffnetError
             It is refused; what was uploaded before stays.
         """
+        with self._here:
+            self._require_open()
+            return self._keep(role, name, content)
+
+    def _keep(self, role: str, name: str, content: bytes) -> tuple[Path, ...]:
         folder = self._folder / f"{role}-{next(self._uploads)}"
         try:
             files = keep(name, content, folder, most=1 if role == "target" else FRAME_LIMIT)
@@ -68,8 +86,8 @@ class Session:
             shutil.rmtree(former, ignore_errors=True)
         return tuple(files)
 
-    def result(self, suffix: str) -> tuple[str, bytes]:
-        """The name and content of a file of the result; an animated GLB of several frames.
+    def result(self, suffix: str) -> Result:
+        """A file of the result: an animated GLB of several frames; a .zip where materials and textures go with it.
 
         Raises
         ------
@@ -79,19 +97,22 @@ class Session:
         outcome = self.outcome
         if outcome is None:
             raise MeshError("nothing is posed yet: choose a source and a target")
-        out = self._folder / "result" / f"{outcome.file.path.stem}-posed{suffix}"
-        frames = [frame.posed.vertices for frame in outcome.frames]
-        if len(frames) > 1 and suffix == ".glb":
-            write_animation(outcome.file, frames, out, frames_per_second=outcome.asked.switches.fps)
-        else:
-            out.parent.mkdir(exist_ok=True)
-            write_posed(outcome.file, frames[-1], out)
-        return out.name, out.read_bytes()
+        with self._here:
+            self._require_open()
+            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
+                out = Path(folder) / f"{outcome.file.path.stem}-posed{suffix}"
+                left_out = _written(outcome, out)
+                return Result(*_file_or_zip(out), [self.plain(line) for line in left_out])
 
     def close(self) -> None:
         """End the work and remove the folder."""
         self._newest.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        with self._here:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _require_open(self) -> None:
+        if not self._folder.is_dir():
+            raise MeshError("this page is closed: load it again")
 
     def _pose(self, asked: Asked, stale: Callable[[], bool]) -> None:
         self._view.posing()
@@ -113,3 +134,24 @@ class Session:
         """A message in which files are called by their names, not by where they lie."""
         text = re.sub(rf"{re.escape(str(self._folder))}/([\w-]+/)?", "", str(error))
         return printable(text.replace("look at --picture", "look at it"))
+
+
+def _written(outcome: Outcome, out: Path) -> list[str]:
+    """Write the result, and what lies beside it; what was left out, a line each."""
+    frames = [frame.posed.vertices for frame in outcome.frames]
+    if len(frames) > 1 and out.suffix == ".glb":
+        write_animation(outcome.file, frames, out, frames_per_second=outcome.asked.switches.fps)
+        return []
+    return write_posed(outcome.file, frames[-1], out)
+
+
+def _file_or_zip(out: Path) -> tuple[str, bytes]:
+    """The file, or a zip of it and of all that lies beside it."""
+    files = sorted(path for path in out.parent.rglob("*") if path.is_file())
+    if files == [out]:
+        return out.name, out.read_bytes()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in files:
+            archive.write(path, path.relative_to(out.parent))
+    return f"{out.stem}.zip", packed.getvalue()

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from datagen.common.arrays import Floats
-from datagen.common.errors import MeshError
+from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import MeshFile, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh, bounding_box
 from training.inference.orientation import UPRIGHT, Axes
@@ -194,14 +194,27 @@ def _job(asked: Asked, sources: list[Path], target: Path, folder: Path, *, named
         paths=[str(sources[0]), str(target)], source=None, target=None, out=folder / "posed.glb",
         picture=False, viewer=False, source_geometry=(), target_geometry=(), model=named, **vars(asked.switches),
     )  # fmt: skip
-    if all(isinstance(body, Figure) for body in (asked.source, asked.target)):
-        options.up, options.front = UPRIGHT.up, UPRIGHT.front  # how made-up bodies stand is known
-        options.align = False
+    made_up = [isinstance(body, Figure) for body in (asked.source, asked.target)]
+    if any(made_up) and (all(made_up) or options.up or options.front):  # what is chosen is said of one's own mesh
+        options.up = ",".join(UPRIGHT.up if known else options.up or UPRIGHT.up for known in made_up)
+        options.front = ",".join(UPRIGHT.front if known else options.front or UPRIGHT.front for known in made_up)
+        options.align = options.align and not all(made_up)
     if not asked.moving:
         options.smooth = "0"
         return TransferJob.from_options(options)
     options.paths[0] = str(sources[0].parent)
     return replace(TransferJob.from_options(options), sources=sources)
+
+
+def clash_of(source: Body, target: Body, switches: Switches) -> str | None:
+    """What is to be chosen yet where Up and Front, said of a mesh of one's own, are along one line."""
+    if isinstance(source, Figure) and isinstance(target, Figure):
+        return None
+    try:
+        Axes(switches.up or UPRIGHT.up, switches.front or UPRIGHT.front)
+    except RecipeError as error:
+        return str(error)
+    return None
 
 
 def _upright(source: Mesh, target: Mesh, posed: Mesh, axes: tuple[Axes | Standing, Axes | Standing]) -> Posed:

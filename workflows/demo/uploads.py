@@ -1,10 +1,12 @@
 """Files that a person sends to the page: what is taken, and the folder of the session in which they lie.
 
 A file gets a name of harmless letters in a folder of its own, whatever it was called, and is then read as
-``dsffnet transfer`` reads it. A zip holds the frames of a sequence, or a mesh with its materials and textures.
+``dsffnet transfer`` reads it. A zip holds the frames of a sequence, or a mesh with its materials and textures, in which
+case these lie where they lay beside it.
 """
 
 import io
+import lzma
 import re
 import zipfile
 import zlib
@@ -23,7 +25,10 @@ VERTEX_LIMIT = 100_000
 """Of a mesh on the page; ``dsffnet transfer`` takes more."""
 ACCEPTED = ",".join((*FORMATS, ".zip"))
 _BESIDE = (".mtl", ".png", ".jpg", ".jpeg")  # of an OBJ or PLY
-_LONGEST_NAME = 60
+_LONGEST_NAME, _DEEPEST = 60, 8
+_UNREADABLE = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, OSError, EOFError, ValueError,
+)  # fmt: skip
 
 
 def require_size(name: str, size: int) -> None:
@@ -53,29 +58,32 @@ def keep(name: str, content: bytes, folder: Path, *, most: int = FRAME_LIMIT) ->
     suffix = _suffix(name)
     if suffix not in (*FORMATS, ".zip"):
         raise MeshError(f"{printable(name)} is none of {', '.join(FORMATS)}, nor a .zip of such frames")
-    files = _unpacked(name, content, most) if suffix == ".zip" else {_harmless(name): content}
-    folder.mkdir(parents=True)
+    files = _unpacked(name, content, most) if suffix == ".zip" else {Path(_harmless(name).name): content}
+    beside = {path.parent for path in files if _suffix(path.name) in FORMATS}
+    if len(beside) > 1:
+        raise MeshError(f"{printable(name)} holds meshes in {len(beside)} folders: put those of one sequence into one")
     for harmless, its in files.items():
+        (folder / harmless).parent.mkdir(parents=True, exist_ok=True)
         (folder / harmless).write_bytes(its)
-    return frames_of(folder)
+    return frames_of(folder / beside.pop())
 
 
-def _unpacked(name: str, content: bytes, most: int) -> dict[str, bytes]:
-    """Meshes, materials and textures of a zip by name, without its folders."""
+def _unpacked(name: str, content: bytes, most: int) -> dict[Path, bytes]:
+    """Meshes, materials and textures of a zip, by the place that each gets."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             wanted = [entry for entry in archive.infolist() if _is_wanted(entry)]
             _require_few(name, wanted, most)
             files = {_harmless(entry.filename): archive.read(entry) for entry in wanted}
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError, EOFError, ValueError) as error:
+    except _UNREADABLE as error:
         raise MeshError(f"{printable(name)} cannot be read as a zip: {error}") from error
-    if len(files) < len(wanted):
+    if len(files) < len(wanted) or any(parent in files for path in files for parent in path.parents):
         raise MeshError(f"{printable(name)} holds two files of one name; frames need names of their own")
     return files
 
 
 def _is_wanted(entry: zipfile.ZipInfo) -> bool:
-    path = PurePosixPath(entry.filename)
+    path = PurePosixPath(entry.filename.replace("\\", "/"))
     is_hidden = path.name.startswith(".") or "__MACOSX" in path.parts
     return not entry.is_dir() and not is_hidden and _suffix(path.name) in (*FORMATS, *_BESIDE)
 
@@ -99,8 +107,13 @@ def _suffix(name: str) -> str:
     return PurePosixPath(name).suffix.lower()
 
 
-def _harmless(name: str) -> str:
-    """A file's own name, without folders and of few letters."""
-    last = PurePosixPath(name.replace("\\", "/")).name
-    stem = re.sub(r"[^\w.-]+", "_", PurePosixPath(last).stem, flags=re.ASCII).lstrip(".-")
-    return f"{stem[-_LONGEST_NAME:] or 'mesh'}{_suffix(last)}"
+def _harmless(name: str) -> Path:
+    """A file's place below a folder that nothing leaves, of few letters; materials name each other with spaces."""
+    parts = [part for part in re.split(r"[\\/]", name) if part not in ("", ".", "..")]
+    return Path(*map(_harmless_part, parts[-_DEEPEST:]))
+
+
+def _harmless_part(part: str) -> str:
+    plain = re.sub(r"[^\w. -]+", "_", part, flags=re.ASCII)
+    path = PurePosixPath(plain)
+    return f"{path.stem.lstrip('.-')[-_LONGEST_NAME:] or 'mesh'}{path.suffix[:_LONGEST_NAME]}"

@@ -1,6 +1,8 @@
 """Sessions: the newest counts, two know nothing of each other, and nothing stays when one ends."""
 
+import io
 import threading
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +16,12 @@ from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.poses import draw_poses
 from datagen.recipe import LegBody, PoseRecipe, RangePoses
+from training.inference.orientation import Axes
 from workflows.cli import main as cli
+from workflows.demo.bodies import PERSON, Figure
 from workflows.demo.newest import Newest
 from workflows.demo.session import Session
-from workflows.demo.transfers import Asked, Outcome, Switches, Transfers
+from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of
 from workflows.pretrained import own_weights
 
 STANDING = Switches(up="Y", front="Z")
@@ -123,7 +127,7 @@ def test_the_result_is_that_of_the_command_line(
     session.ask(Asked(source, target, Switches(up="Y", front="Z", refine=True)))
     view.wait()
     assert not view.failures
-    name, content = session.result(".obj")
+    name, content, _ = session.result(".obj")
     out = tmp_path / "posed.obj"
     options = ["--model", "human", "--up", "Y", "--front", "Z", "--refine"]
     cli.main(["transfer", str(legs[1]), str(legs[0]), "-o", str(out), *options])
@@ -139,7 +143,7 @@ def test_frames_come_one_after_the_other_and_go_into_one_animation(
     session.ask(Asked(tuple(legs), target, STANDING, moving=True))
     view.wait()
     assert [outcome.count for outcome in view.frames] == [3, 3, 3]
-    name, content = session.result(".glb")
+    name, content, _ = session.result(".glb")
     assert name == "leg0-posed.glb" and b'"animations"' in content
 
 
@@ -209,3 +213,50 @@ def test_an_unexpected_failure_is_said_and_ends_nothing(tmp_path: Path, legs: li
         view.wait()
     session.close()
     assert len(view.failures) == 2 and "one in a thousand" in view.failures[0]
+
+
+@pytest.mark.parametrize("place", ["source", "target"])
+def test_up_and_front_are_said_of_ones_own_mesh_alone(
+    place: str, legs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transfers: Transfers
+) -> None:
+    own, made_up = Mesh(load_mesh(legs[0]).vertices, load_mesh(legs[0]).faces), Figure(PERSON, (0.5,) * 6, 1.0)
+    monkeypatch.setattr("workflows.demo.transfers.mesh_of", lambda _: own)  # a person takes seconds to read
+    lying = tmp_path / "lying.obj"
+    save_mesh(Mesh(Axes("Z", "-Y").restored(own.vertices), own.faces), lying)
+    bodies: dict[str, Any] = {"source": made_up, "target": made_up} | {place: (lying,)}
+    frames = list[Outcome]()
+    asked = Asked(**bodies, switches=Switches(up="Z", front="-Y", force=True))
+    transfers.run(asked, tmp_path / "work", lambda: False, frames.append)
+    for shown in (frames[0].frames[0].source, frames[0].frames[0].target):
+        assert np.allclose(shown.vertices, own.vertices, atol=1e-4)
+
+
+def test_up_alone_waits_for_front(legs: list[Path]) -> None:
+    made_up, own = Figure(PERSON, (0.5,) * 6, 1.0), (legs[0],)
+    assert "cannot have Z up and face Z" in (clash_of(made_up, own, Switches(up="Z")) or "")
+    assert clash_of(made_up, own, Switches(up="Z", front="-Y")) is None
+    assert clash_of(made_up, made_up, Switches(up="Z")) is None
+
+
+def test_textures_come_along_in_a_zip_and_what_is_lost_is_said(session: Session, view: Seen, legs: list[Path]) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("my body.obj", b"mtllib my body.mtl\nusemtl skin\n" + legs[0].read_bytes())
+        archive.writestr("my body.mtl", b"newmtl skin\nmap_Kd textures/skin.png\nmap_Bump gone.png\n")
+        archive.writestr("textures/skin.png", b"\x89PNG")
+    target = session.keep("target", "body.zip", packed.getvalue())
+    session.ask(Asked((legs[1],), target, STANDING))
+    view.wait()
+    name, content, left_out = session.result(".obj")
+    assert name == "my body-posed.zip"
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert sorted(archive.namelist()) == ["my body-posed.obj", "my body.mtl", "textures/skin.png"]
+    assert any("gone.png is not beside the mesh" in line for line in left_out)
+
+
+def test_nothing_is_kept_after_the_end(tmp_path: Path, transfers: Transfers, view: Seen, legs: list[Path]) -> None:
+    session = Session(tmp_path / "s", transfers, view)
+    session.close()
+    with pytest.raises(MeshError, match="this page is closed"):
+        upload(session, "target", legs[0])
+    assert not (tmp_path / "s").exists()
