@@ -3,6 +3,8 @@
 import argparse
 import contextlib
 import threading
+import time
+from collections.abc import Callable, Iterator
 
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
 from workflows.cli.transfer import add_model_option, weights_of
@@ -18,17 +20,40 @@ def demo_command(options: argparse.Namespace) -> None:
       dsffnet demo --model runs/quickstart --port 8001
     """
     require_free(options.host, options.port, another=f"dsffnet demo --port {options.port + 1}")
-    print_text("reading the weights and the bodies (a minute where Anny is read for the first time) ...")
-    from workflows.demo.server import DemoServer
-    from workflows.demo.transfers import Transfers
-
     with weights_of(options) as weights:
-        transfers = Transfers(weights)
-        transfers.warm_up()
+        with saying_what_it_does() as say:
+            say("loading the libraries")
+            from workflows.demo.server import DemoServer
+            from workflows.demo.transfers import Transfers
+
+            transfers = Transfers(weights)
+            transfers.warm_up(say)
         server = DemoServer(transfers, host=options.host, port=options.port)
         print_text(f"http://{options.host}:{server.port}   (Ctrl-C ends it)")
         with contextlib.closing(server):
             _until_interrupted()
+
+
+@contextlib.contextmanager
+def saying_what_it_does(seconds: float = 5.0) -> Iterator[Callable[[str], None]]:
+    """Print what is being done, and every so many seconds that it still is."""
+    done, doing, began = threading.Event(), [""], time.monotonic()
+
+    def repeat() -> None:
+        while not done.wait(seconds):
+            print_text(f"still {doing[0]}: {time.monotonic() - began:.0f} s since the start")
+
+    def say(what: str) -> None:
+        doing[0] = what
+        print_text(f"{what} ...")
+
+    teller = threading.Thread(target=repeat, daemon=True)
+    teller.start()
+    try:
+        yield say
+    finally:
+        done.set()
+        teller.join()
 
 
 def _until_interrupted() -> None:

@@ -35,6 +35,14 @@ class Page:
         self._client, self._transfers = client, transfers
         self.session = Session(folder, transfers, self)
         self._closed = threading.Event()
+        try:
+            self._build()
+        except BaseException:
+            self.close()
+            raise
+
+    def _build(self) -> None:
+        client = self._client
         self._stage = Stage(client)
         self._drawing = threading.RLock()
         self._frame = 0
@@ -168,9 +176,10 @@ class Page:
         return download
 
     def _draw_again(self) -> None:
-        if self.session.outcome is not None:
-            frames = self.session.outcome.frames
-            self._draw(self.session.outcome, frames[self._frame % len(frames)])
+        with self._drawing:
+            outcome = self.session.outcome
+            if outcome is not None:
+                self._draw(outcome, outcome.frames[self._frame % len(outcome.frames)])
 
     def _draw(self, outcome: Outcome, frame: Posed) -> None:
         with self._drawing, self._client.atomic():
@@ -188,14 +197,19 @@ class Page:
     def _play(self) -> None:
         """Show the frames of a sequence, one after the other; of a walk also backwards."""
         while not self._closed.wait(1 / Switches.fps):
-            outcome = self.session.outcome
-            if outcome is None or len(outcome.frames) < 2:
-                continue
-            count, self._frame = len(outcome.frames), self._frame + 1
-            place = self._frame % count
-            if isinstance(outcome.asked.source, Figure):
-                place = abs((self._frame + count - 1) % (2 * count - 2) - (count - 1))
-            self._draw(outcome, outcome.frames[place])
+            with self._drawing:  # else a frame of what was could come after the first of what is
+                outcome = self.session.outcome
+                if outcome is not None and len(outcome.frames) > 1:
+                    self._frame += 1
+                    self._draw(outcome, outcome.frames[_place(self._frame, outcome)])
+
+
+def _place(frame: int, outcome: Outcome) -> int:
+    """Which frame of a sequence comes as the so manieth."""
+    count = len(outcome.frames)
+    if isinstance(outcome.asked.source, Figure):
+        return abs((frame + count - 1) % (2 * count - 2) - (count - 1))
+    return frame % count
 
 
 def _about(outcome: Outcome) -> str:

@@ -16,6 +16,8 @@ from workflows.demo.uploads import require_size
 
 PEOPLE = 8
 """At the page at once."""
+UPLOADS = 2
+"""Of one person under way at once: of source and of target."""
 
 
 class DemoServer:
@@ -54,6 +56,8 @@ class DemoServer:
 
     def _open(self, client: viser.ClientHandle) -> None:
         with self._lock:
+            if client.client_id not in self._server.get_clients():
+                return  # left before it got its turn: nobody would take its page away
             if len(self._pages) >= PEOPLE:
                 client.add_notification("Full", f"{PEOPLE} people are at this page: come back later", color="red")
                 return
@@ -77,6 +81,8 @@ def stop_large_uploads(client: viser.ClientHandle) -> None:
     def begins(_: int, message: messages.FileTransferStartUpload) -> None:
         try:
             require_size(message.filename, message.size_bytes)
+            if len(gui._current_file_upload_states) > UPLOADS:  # viser has counted this one already
+                raise MeshError(f"{UPLOADS} uploads are under way: wait for them, or load the page again")
         except MeshError as error:
             gui._current_file_upload_states.pop(message.transfer_uuid, None)
             size = message.size_bytes  # taken for received, the browser's button is free again

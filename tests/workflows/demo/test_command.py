@@ -3,10 +3,12 @@
 import socket
 import subprocess
 import sys
+import time
 
 import pytest
 
 from workflows.cli import main as cli
+from workflows.cli.demo import saying_what_it_does
 
 
 def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,3 +32,13 @@ def test_weights_that_are_not_there_are_one_line(capsys: pytest.CaptureFixture[s
 def test_other_commands_do_not_import_it() -> None:
     look = "import sys; from workflows.cli.main import parsed; parsed(['demo']); print('viser' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_long_work_is_not_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    with saying_what_it_does(seconds=0.02) as say:
+        say("reading people")
+        time.sleep(0.3)
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "reading people ..." and said[1].startswith("still reading people: 0 s")
+    time.sleep(0.1)
+    assert not capsys.readouterr().out

@@ -1,7 +1,9 @@
 """Sessions: the newest counts, two know nothing of each other, and nothing stays when one ends."""
 
+import gc
 import io
 import threading
+import weakref
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +23,7 @@ from workflows.cli import main as cli
 from workflows.demo.bodies import PERSON, Figure
 from workflows.demo.newest import Newest
 from workflows.demo.session import Session
-from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of
+from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of, require_room
 from workflows.pretrained import own_weights
 
 STANDING = Switches(up="Y", front="Z")
@@ -260,3 +262,40 @@ def test_nothing_is_kept_after_the_end(tmp_path: Path, transfers: Transfers, vie
     with pytest.raises(MeshError, match="this page is closed"):
         upload(session, "target", legs[0])
     assert not (tmp_path / "s").exists()
+
+
+def test_of_many_transfers_one_result_is_kept(tmp_path: Path, transfers: Transfers, legs: list[Path]) -> None:
+    outcomes = list[weakref.ref[Outcome]]()
+
+    class Forgetful(Seen):
+        def show(self, outcome: Outcome) -> None:
+            outcomes.append(weakref.ref(outcome))
+            self.done.release()
+
+    view = Forgetful()
+    session = Session(tmp_path / "s", transfers, view)
+    for number in range(20):
+        session.ask(Asked((legs[number % 3],), (legs[0],), STANDING))
+        view.wait()
+    session.close()
+    gc.collect()
+    alive = [outcome() for outcome in outcomes if outcome() is not None]
+    assert len(outcomes) == 20 and alive == [session.outcome]
+
+
+def test_frames_share_what_does_not_move(session: Session, view: Seen, legs: list[Path]) -> None:
+    session.ask(Asked(tuple(legs), (legs[0],), STANDING, moving=True))
+    view.wait()
+    first, *others = view.frames[-1].frames
+    for frame in others:
+        assert frame.target is first.target and frame.source.faces is first.source.faces
+        assert {mesh.vertices.dtype for mesh in (frame.source, frame.output, frame.posed)} == {np.dtype(np.float32)}
+
+
+def test_a_sequence_of_too_many_vertices_is_refused(legs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = load_mesh(legs[0])
+    require_room(240, mesh, mesh)
+    monkeypatch.setattr("workflows.demo.transfers.MOTION_LIMIT", 100)
+    require_room(1, mesh, mesh)
+    with pytest.raises(MeshError, match="the page plays 100: take fewer frames"):
+        require_room(3, mesh, mesh)
