@@ -121,7 +121,8 @@ def _training_stage(
 ) -> Stage:
     def work() -> None:
         train_model(training, folder.data, run, parent=folder.path, tasks=tasks, name=name, model=model)
-        mark_of(folder.path, "evaluate").unlink(missing_ok=True)  # an evaluation does not lie within what is beside it
+        if name != "train":  # the evaluation lies within the run, and is not removed with what is beside it
+            mark_of(folder.path, "evaluate").unlink(missing_ok=True)
 
     return Stage(
         name,

@@ -54,6 +54,7 @@ def publish(root: Path, server: Server) -> None:
 
     for chatty in ("mlflow", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # its stacks are of errors that it raises, too
     failures: list[Exception] = []
     try:
         prepare_store(server)
