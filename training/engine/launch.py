@@ -78,7 +78,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     except Exception as error:
         raise failure_of(run) or TrainingError(
             f"the training ranks died {_RESTARTS + 1} times without a new checkpoint; the last reason: "
-            f"{(str(error).strip().splitlines() or [type(error).__name__])[-1]}. "
+            f"{_last_line(error)}. "
             "Run the same command again to resume from the newest checkpoint"
         ) from error
     failure = failure_of(run)
@@ -118,7 +118,13 @@ def fit_while_progressing(fit: Callable[[], object], run: Path) -> None:
         except Exception as error:
             if (run / _FAILURE).exists() or (run / STOP_FILE).exists() or _newest(run) == before:
                 raise
-            log.warning("the training ranks died %d times (%s); going on, as there is progress", _RESTARTS + 1, error)
+            words = "the training ranks died %d times, at last of: %s; going on, as there is progress"
+            log.warning(words, _RESTARTS + 1, _last_line(error))
+
+
+def _last_line(error: Exception) -> str:
+    """What Ray's account of dead ranks, with the stacks of all, ends in."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
 
 
 def _newest(run: Path) -> str:

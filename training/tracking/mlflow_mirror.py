@@ -54,7 +54,7 @@ def publish(root: Path, server: Server) -> None:
 
     for chatty in ("mlflow", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # its stacks are of errors that it raises, too
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # raised, too
     failures: list[Exception] = []
     try:
         prepare_store(server)
@@ -292,7 +292,12 @@ def _experiment(client: Any, server: Server, *, mark: bool = False) -> str:
     found = client.get_experiment_by_name(EXPERIMENT)
     if found is None:
         place = server.artifacts.as_uri() if server.artifacts else None
-        return str(client.create_experiment(EXPERIMENT, place, tags=EXPERIMENT_TAGS))
+        try:
+            return str(client.create_experiment(EXPERIMENT, place, tags=EXPERIMENT_TAGS))
+        except MlflowException:  # another process made it meanwhile, or it cannot be made
+            found = client.get_experiment_by_name(EXPERIMENT)
+            if found is None:
+                raise
     if mark:
         try:
             mark_experiment(client, found)
