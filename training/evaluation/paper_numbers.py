@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from training.recipes.networks import AvatarRecipe, TemplateRecipe
 from training.recipes.training import CoreNet3dRecipe, NetworkRecipe, NptRecipe, PartsRecipe
 
 PaperData = Literal["SMPL", "SMAL"]
@@ -88,6 +89,8 @@ def method_name(network: NetworkRecipe) -> str:
         return CORENET3D
     if isinstance(network, NptRecipe):
         return NPT if network.variant == "maxpool" else f"{NPT} {network.variant}"
+    if isinstance(network, TemplateRecipe | AvatarRecipe):
+        return f"FITE {network.name}"
     if not network.feature_fusion:
         return f"{DSFFNET} {WITHOUT_FUSION}"
     return DSFFNET if network.target_side else f"{DSFFNET} {WITHOUT_TARGET_SIDE}"
