@@ -1,6 +1,8 @@
 """Dressed people: pictures of every outfit, and how good draped garments are.
 
 python -m benchmarks.clothed picture docs/images/bodies-clothed.png
+python -m benchmarks.clothed sheet docs/images/clothed-people.png --identities 6 --poses 1 --subdivide 0
+python -m benchmarks.clothed walk docs/images/clothed-walk.gif
 python -m benchmarks.clothed measure [--identities 3] [--poses 4]
 """
 
@@ -10,19 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
+from PIL import Image
 
 from datagen.bodies.clothed.draping import depths
 from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.skinning import skin
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, edges_of
+from datagen.mesh.parts import part_colors
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import OUTFITS, AnnyBody, ClothedBody, DrapeSolver, PhenotypeRanges, PoseRecipe
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
+from training.viz.render.camera import frame
+from training.viz.render.renderer import render_mesh
 
-_COLORS = np.array([to_rgb(color) for color in ("#D9A98A", "#55708F", "#C9B458", "#8F4E4E")])
 _PEOPLE = {"adult": (0.8, 0.7, 0.5, 0.5, 0.5, 0.3), "child": (0.5, 0.3, 0.5, 0.5, 0.5, 0.5),
            "elder": (0.2, 1.0, 0.3, 0.8, 0.4, 0.6)}  # fmt: skip
 _SHOWN: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -48,12 +52,64 @@ def picture(path: Path) -> None:
     for number, outfit in enumerate(OUTFITS):
         for name, phenotypes in _PEOPLE.items():
             parameters = np.array([*phenotypes, number, 1.0])
-            faces, colors = model.faces(parameters), _COLORS[model.part_labels(parameters)]
+            faces, colors = model.faces(parameters), part_colors(model.part_labels(parameters)) / 255
             posed = model.vertices(parameters, poses)
             rows.append(Row(f"{outfit}\n{name}", [Panel(Mesh(standing(one), faces), colors) for one in posed]))
             print(outfit, name, flush=True)
     title = "Every outfit in four poses, draped, on an adult, a child and an old person"
     mesh_grid(rows, path, columns=list(_SHOWN), title=title, one_scale=False, size=(230, 250))
+
+
+def sheet(path: Path, people: int, poses: int, subdivide: int) -> None:
+    """Random people of all ages, each in every outfit, in NPT's first poses."""
+    body = AnnyBody(topology="anny", phenotypes=PhenotypeRanges(age=(0, 1)))
+    model = ClothedModel(ClothedBody(body=body, detail=subdivide, solver=DrapeSolver(subdivide=subdivide)))
+    drawn, rows = draw_poses(PoseRecipe(), range(poses)), []
+    for identity in range(people):
+        person, panels = model.draw_identity(generator(1, Stream.IDENTITY, identity), identity), []
+        for number in range(len(OUTFITS)):
+            parameters = np.array([*person[:-2], number, person[-1]])
+            faces, colors = model.faces(parameters), part_colors(model.part_labels(parameters)) / 255
+            posed = model.vertices(parameters, drawn)
+            assert np.isfinite(posed).all()
+            panels += [Panel(Mesh(standing(one), faces), colors) for one in posed]
+        age = person[model.parameter_names.index("age")]
+        rows.append(Row(f"person {identity}\nage {age:.2f}", panels))
+        print(identity, flush=True)
+    columns = [f"{outfit}, {pose}" for outfit in OUTFITS for pose in range(poses)]
+    title = f"{people} random people of all ages in every outfit, in NPT's first poses, draped"
+    mesh_grid(rows, path, columns=columns, title=title, one_scale=False, size=(150, 150))
+
+
+def walk(path: Path, frames: int = 20) -> None:
+    """Two people who walk on the spot, as a GIF that loops; each frame is draped alone."""
+    body, size = AnnyBody(topology="anny"), (260, 400)
+    model, strips = ClothedModel(ClothedBody(body=body, detail=1)), []
+    angle = np.radians(50)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    for outfit, phenotypes in (("skirt", (0.1, 0.66, 0.5, 0.4, 0.5, 0.4)), ("coat", _PEOPLE["adult"])):
+        parameters = np.array([*phenotypes, list(OUTFITS).index(outfit), 1.0])
+        faces, colors = model.faces(parameters), part_colors(model.part_labels(parameters)) / 255
+        posed = [one @ turn.T - [0, one[:, 1].min(), 0] for one in model.vertices(parameters, _steps(frames))]
+        camera = frame([Mesh(one, faces) for one in posed], size=size)
+        look: dict[str, Any] = {"colors": colors, "camera": camera, "size": size, "background": (1.0, 1.0, 1.0)}
+        strips.append([render_mesh(one, faces, **look) for one in posed])
+    pictures = [Image.fromarray(np.concatenate(pair, axis=1)).quantize(96) for pair in zip(*strips, strict=True)]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=60, loop=0, optimize=True)
+
+
+def _steps(frames: int) -> Poses:
+    """A stride of the left and one of the right leg; what is on the right is half a turn behind."""
+    time = np.arange(frames) * 2 * np.pi / frames
+    degrees = np.zeros((frames, len(JOINTS), 3))
+    for side, sign, phase in (("left", 1, time), ("right", -1, time + np.pi)):
+        swing = np.sin(phase)
+        degrees[:, JOINTS.index(f"{side}_hip"), 0] = -8 - 26 * swing
+        degrees[:, JOINTS.index(f"{side}_knee"), 0] = 12 + 38 * np.clip(np.cos(phase - 0.4), 0, 1)
+        degrees[:, JOINTS.index(f"{side}_shoulder"), 2] = -58 * sign
+        degrees[:, JOINTS.index(f"{side}_elbow"), 1] = -sign * (25 - 15 * swing)
+        degrees[:, JOINTS.index(f"{side}_shoulder"), 1] = 18 * sign * swing
+    return Poses(JOINTS, PARENTS, np.radians(degrees))
 
 
 def _shown_poses() -> Poses:
@@ -112,7 +168,7 @@ def _apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["picture", "measure"])
+    parser.add_argument("what", choices=["picture", "sheet", "walk", "measure"])
     parser.add_argument("path", nargs="?", type=Path, default=Path("docs/images/bodies-clothed.png"))
     parser.add_argument("--identities", type=int, default=3)
     parser.add_argument("--poses", type=int, default=4)
@@ -120,5 +176,9 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if given.what == "picture":
         picture(given.path)
+    elif given.what == "sheet":
+        sheet(given.path, given.identities, given.poses, given.subdivide)
+    elif given.what == "walk":
+        walk(given.path)
     else:
         measure(given.identities, given.poses, given.subdivide)

@@ -3,7 +3,8 @@
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,11 +15,16 @@ from datagen.common.errors import DatasetError, RecipeError, StorageError
 from datagen.common.files import write_atomically
 from datagen.grid import POSE_TYPES
 from datagen.mesh.files import save_mesh
+from datagen.mesh.formats.glb_export import parts_draft
+from datagen.mesh.formats.glb_writer import Draft
 from datagen.mesh.formats.obj import face_lines, vertex_lines
+from datagen.mesh.formats.surface import Material, linear
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.parts import part_colors, part_name
 from datagen.store import Dataset
 
-ExportLayout = Literal["npt-obj", "npt-ply", "obj", "ply", "glb"]
+ExportLayout = Literal["npt-obj", "npt-ply", "obj", "ply", "glb", "glb-animated"]
+_POSES_A_SECOND = 2.0  # of an animation: most datasets' poses are drawn one by one, and are no motion
 Cell = tuple[int, int]
 """An identity and a pose."""
 Progress = Callable[[Sequence[Cell]], Iterable[Cell]]
@@ -34,7 +40,9 @@ class _Names:
         return self.layout.startswith("npt-")
 
     def of(self, cell: Cell) -> str:
-        """Path of a mesh's file within the folder."""
+        """Path of a mesh's file within the folder; all poses of an identity are in one file where it is animated."""
+        if self.layout == "glb-animated":
+            return f"identity-{cell[0]:04d}.glb"
         suffix = self.layout.removeprefix("npt-")
         if self.flat:
             return f"{self.prefix}{cell[0]}_{cell[1]}.{suffix}"
@@ -64,6 +72,9 @@ def export_dataset(
     layout
         ``npt-obj`` and ``npt-ply``: one folder of ``{identity}_{pose}.obj``, and the evaluation triples as text lists
         in the published order (target, source, truth). ``obj``, ``ply``, ``glb``: ``identity-0003/pose-0012.glb``.
+        ``glb-animated``: ``identity-0003.glb``, whose animation goes through the poses, two a second. Of dressed
+        people the files of ``glb`` and ``glb-animated`` have a geometry and a material for the skin and for each
+        garment, those of ``obj`` a group.
     identities, poses
         Which ones, by number; without them all. An identity is written in those poses that it was made in.
     prefix
@@ -80,6 +91,8 @@ def export_dataset(
         A layout, identity or pose that does not exist, or a prefix that is more than a piece of a file's name.
     DatasetError
         The folder is a file, or holds something other than an export of this dataset in this layout.
+    MeshError
+        An animation of more than 2,000 poses.
     StorageError
         A file could not be written, such as on a full disk; those that are there are whole.
     """
@@ -88,6 +101,7 @@ def export_dataset(
         raise RecipeError(f"no layout {layout!r} to export to; there are {', '.join(get_args(ExportLayout))}")
     place, names, cells = Path(folder), _Names(layout, prefix), _cells(dataset, identities, poses)
     try:
+        _claim(place, _readme(dataset, names, cells))
         return _export(dataset, place, names, progress(cells), fresh)
     except (StorageError, PermissionError) as error:
         raise StorageError(
@@ -97,32 +111,63 @@ def export_dataset(
 
 
 def _export(dataset: Dataset, place: Path, names: _Names, cells: Iterable[Cell], fresh: bool) -> int:
-    _claim(place, _readme(dataset, names))
-    topology = lru_cache(maxsize=1)(lambda identity: _Topology(dataset.faces(identity)))
+    topology = lru_cache(maxsize=1)(partial(_Topology, dataset, names))
     written = 0
-    for identity, pose in cells:
-        path = place / names.of((identity, pose))
-        if fresh or not path.exists():
-            topology(identity).save(dataset.vertices(identity, pose), path)
-            written += 1
+    for name, of in groupby(cells, key=names.of):
+        path = place / name
+        if not fresh and path.exists():
+            continue
+        first = next(of)
+        if names.layout == "glb-animated":
+            frames = (dataset.vertices(*cell).astype(np.float64) for cell in chain([first], of))
+            topology(first[0]).draft().animated(frames, path, frames_per_second=_POSES_A_SECOND)
+        else:
+            topology(first[0]).save(dataset.vertices(*first), path)
+        written += 1
     if names.flat:
         _write_lists(dataset, place, names)
     return written
 
 
 class _Topology:
-    """The faces [face, 3] of an identity, whose lines in OBJ files are made once for all of its poses."""
+    """The faces [face, 3] of an identity and, where its layout tells them apart, the parts of its vertices.
 
-    def __init__(self, faces: NDArray[np.int32]) -> None:
-        self._faces = faces
+    Their lines in OBJ files are made once for all of its poses.
+    """
+
+    def __init__(self, dataset: Dataset, names: _Names, identity: int) -> None:
+        self._faces, self._count = dataset.faces(identity), dataset.vertex_count(identity)
+        self._part = None if names.flat else dataset.part(identity)
         self._lines = ""
 
     def save(self, vertices: NDArray[np.float32], path: Path) -> None:
-        if path.suffix != ".obj":
+        if path.suffix == ".obj":
+            self._lines = self._lines or self._face_lines()
+            write_atomically(path, (vertex_lines(vertices) + self._lines).encode())
+        elif path.suffix == ".glb" and self._part is not None:
+            write_atomically(path, self.draft().static(vertices.astype(np.float64)))
+        else:
             save_mesh(Mesh(vertices, self._faces), path)
-            return
-        self._lines = self._lines or face_lines(self._faces)
-        write_atomically(path, (vertex_lines(vertices) + self._lines).encode())
+
+    def draft(self) -> Draft:
+        """A GLB file that lacks its positions, a geometry a part."""
+        if self._part is None:
+            whole = np.zeros(self._count, np.int64)
+            return parts_draft(self._faces.astype(np.int64), whole, [Material("body")])
+        worn, place = np.unique(self._part, return_inverse=True)
+        colors = linear(np.column_stack([part_colors(worn), np.full(len(worn), 255, np.uint8)])) / 65535
+        looks = zip(worn.tolist(), colors.tolist(), strict=True)
+        return parts_draft(
+            self._faces.astype(np.int64), place, [Material(part_name(part), tuple(color)) for part, color in looks]
+        )
+
+    def _face_lines(self) -> str:
+        if self._part is None:
+            return face_lines(self._faces)
+        part = self._part[self._faces[:, 0]]
+        pieces = np.split(np.arange(len(part)), np.flatnonzero(np.diff(part)) + 1)
+        named = ((part_name(int(part[piece[0]])).replace(" ", "-"), face_lines(self._faces[piece])) for piece in pieces)
+        return "".join(f"g {name}\n{lines}" for name, lines in named)
 
 
 def _cells(dataset: Dataset, identities: Iterable[int] | None, poses: Iterable[int] | None) -> list[Cell]:
@@ -155,10 +200,14 @@ def _require_prefix(prefix: str) -> None:
         )
 
 
-def _readme(dataset: Dataset, names: _Names) -> str:
+def _readme(dataset: Dataset, names: _Names, cells: Sequence[Cell]) -> str:
+    """What is in the folder; of animations with the poses, which their files' names do not say."""
     attributes = dataset.attributes
+    shown = "identity 0 in pose 0"
+    if names.layout == "glb-animated":
+        shown = f"identity 0 in its poses among {', '.join(map(str, sorted({pose for _, pose in cells})))}"
     return (
-        f"Meshes of the dataset {dataset.uuid}, such as {names.of((0, 0))}, which is identity 0 in pose 0.\n"
+        f"Meshes of the dataset {dataset.uuid}, such as {names.of((0, 0))}, which is {shown}.\n"
         f"Unit: {attributes['units']}. Frame: {attributes['frame']}. Vertices are in the dataset's order.\n"
     )
 

@@ -25,13 +25,15 @@ _SECONDS_MESH, _SECONDS_VERTEX, _SECONDS_IDENTITY, _SECONDS_POSE = 110e-6, 33e-9
 _MEMORY_IDENTITY, _MEMORY_POSE, _MEMORY_SHARD, _MEMORY_TRIPLE = 20_000, 2_000, 1_000, 120
 _MEMORY_VERTEX, _MEMORY_MESHES = 460, 3
 """Bytes of a body a vertex, and how often a task holds the vertices of its shard."""
+_PROCESSES, _OTHERS = "the number of workers", "what other programs take"
+"""What to lower where the body's own files and packages need the memory."""
 
 
 @dataclass(frozen=True)
 class DatasetSize:
     """What a dataset takes. ``disk``, ``seconds`` and ``memory`` are estimates; ``vertices`` is None where unknown.
 
-    ``memory`` has bytes by what needs them: a key of the recipe.
+    ``memory`` has bytes by what can be lowered where they are too many: mostly a key of the recipe.
     """
 
     meshes: int
@@ -126,6 +128,7 @@ def _memory_of(grid: Grid, vertices: float, workers: int) -> dict[str, float]:
         "data.poses": _MEMORY_POSE * grid.pose_count,
         "data.triples.count": _MEMORY_TRIPLE * grid.recipe.triples.count * 2 * len(grid.steps),
         "data.identities or data.poses": _MEMORY_SHARD * grid.shard_count,
+        _PROCESSES if workers > 1 else _OTHERS: workers * grid.recipe.body.worker_bytes,
         "the body's vertices": workers * _MEMORY_VERTEX * vertices,
         "data.store.poses_per_shard": workers * _MEMORY_MESHES * _VERTEX * rows * vertices,
     }

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import MeshFile, read_mesh_file, write_posed
+from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Alone, Encoded, Surface
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
@@ -136,5 +137,5 @@ class _InMemory(Alone):
         self.only_here = []
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
-        """Never asked for: there is no file to write again."""
-        raise NotImplementedError
+        """The same mesh as an OFF file, the plainest there is."""
+        return format_of(".off").build(self.surface, vertices, "mesh", None)

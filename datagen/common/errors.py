@@ -24,6 +24,10 @@ class MeshError(DsffnetError):
     """A mesh file or mesh array that cannot be used (missing, unreadable, empty, not finite, no faces)."""
 
 
+class NotOneBodyError(MeshError):
+    """A file of several geometries that do not make one body, so that some must be chosen."""
+
+
 class BodyError(DsffnetError):
     """A body model that cannot be loaded, or that produced something that is not a mesh."""
 

@@ -70,7 +70,7 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
 class _Topologies:
     """The topologies of a body's identities, numbered as they appear, each with its triangles and count of vertices.
 
-    Vertices are counted in a mesh of the first identity that has them: some may be in no face.
+    Vertices are counted by their labels, or in a mesh of the first identity that has them: some may be in no face.
     """
 
     def __init__(self, recipe: DatasetRecipe, body: BodyModel) -> None:
@@ -85,12 +85,15 @@ class _Topologies:
         faces = self._body.faces(parameters)
         number = self._numbers.setdefault(faces.tobytes(), len(self.faces))
         if number == len(self.faces):
-            one_pose = draw_poses(self._recipe.poses, self._grid.poses_of(identity)[:1])
             self.faces.append(faces)
             if (labels := part_labels(self._body, parameters)) is not None:
                 self.labels[number] = labels
-            self.vertices.append(self._body.vertices(parameters, one_pose).shape[1])
+            self.vertices.append(self._count(identity, parameters) if labels is None else len(labels))
         return number
+
+    def _count(self, identity: int, parameters: NDArray[np.float64]) -> int:
+        one_pose = draw_poses(self._recipe.poses, self._grid.poses_of(identity)[:1])
+        return self._body.vertices(parameters, one_pose).shape[1]
 
 
 def _attributes(recipe: DatasetRecipe, body: BodyModel, source: PoseSource) -> dict[str, Any]:

@@ -12,7 +12,8 @@ geometry is refused.
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,12 +86,34 @@ def load_mesh(path: str | Path) -> Mesh:
     return _read(Path(path), ()).mesh
 
 
+def geometry_names(path: str | Path) -> tuple[str, ...]:
+    """Names that ``geometries`` of :func:`read_mesh_file` can be: a GLB's geometries, an OBJ's objects or groups.
+
+    Raises
+    ------
+    MeshError
+        As :func:`read_mesh_file`, as far as the file is read.
+    """
+    path = Path(path)
+    with _reading(path):
+        return format_of(path.suffix.lower()).names(path)
+
+
 def _read(path: Path, geometries: Sequence[str]) -> MeshFile:
+    with _reading(path):
+        content = format_of(path.suffix.lower()).read(path, geometries)
+        vertices, faces = content.vertices, _faces(content, path)
+    mesh = check_mesh(Mesh(vertices, faces), name=str(path))
+    return MeshFile(path, content.name or path.stem, mesh, content)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Whatever is wrong with a file as MeshError, in one line."""
     require_file(path)
     try:
         refuse_huge(path)
-        content = format_of(path.suffix.lower()).read(path, geometries)
-        vertices, faces = content.vertices, _faces(content, path)
+        yield
     except MeshError:
         raise
     except BodyError as error:
@@ -100,8 +123,6 @@ def _read(path: Path, geometries: Sequence[str]) -> MeshFile:
     except DAMAGE as error:
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
-    mesh = check_mesh(Mesh(vertices, faces), name=str(path))
-    return MeshFile(path, content.name or path.stem, mesh, content)
 
 
 def _one_line(reason: object) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import MeshError
+from datagen.common.errors import MeshError, NotOneBodyError
 
 CHOOSE = "--source-geometry NAME or --target-geometry NAME (again for more)"
 _REACH = 0.1  # of the longest edge of any box: geometries that are nearer than this belong together
@@ -37,7 +37,7 @@ def require_one_body(extents: Mapping[str, NDArray[np.float64]], path: Path) -> 
 
     Raises
     ------
-    MeshError
+    NotOneBodyError
         Some are apart from the others, or one is the ground below them.
     """
     if len(extents) < 2:
@@ -47,7 +47,7 @@ def require_one_body(extents: Mapping[str, NDArray[np.float64]], path: Path) -> 
     ground = [name for place, name in enumerate(names) if _is_ground(boxes, place)]
     if apart or ground:
         what = f"flat and larger than the others: {listed(ground)}" if ground else f"apart: {listed(apart)}"
-        raise MeshError(
+        raise NotOneBodyError(
             f"{path} holds {len(names)} geometries, {listed(names)}, which do not make one body ({what}). "
             f"Choose with {CHOOSE}"
         )

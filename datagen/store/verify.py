@@ -11,6 +11,7 @@ import zarr
 
 from datagen.common.errors import DatasetError, UnsafeFileError, reason_of
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays, Shard
+from datagen.mesh.parts import part_name
 from datagen.recipe import DatasetRecipe, MixedBody
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.attributes import attributes_fault
@@ -123,7 +124,8 @@ def describe(url: str) -> dict[str, Any]:
     if fault:
         raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
     attributes, recipe = attributes_of(group), stored_recipe(url, group)
-    grid, arrays = Grid(recipe), _arrays(Dataset(url, group))
+    dataset = Dataset(url, group)
+    grid, arrays = Grid(recipe), _arrays(dataset)
     shards = arrays.shards() if arrays else []
     sizes = stored_sizes(group, [shard.path for shard in shards])
     facts = {
@@ -135,6 +137,7 @@ def describe(url: str) -> dict[str, Any]:
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
         f"({recipe.poses.distribution.name}, {len(attributes['joints'])} joints)",
         "rig": _rigs(attributes["rigs"]),
+        "clothes": _clothes(dataset, arrays),
         "appended": _growth(recipe),
         "meshes": f"{grid.mesh_count:,} of {_vertex_counts(arrays)} vertices",
         "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
@@ -189,6 +192,22 @@ def _tree(names: Sequence[str], parents: Sequence[int], above: int) -> list[str]
     """The parts that hang on part ``above``, each with those that hang on it in brackets."""
     below = [(name, _tree(names, parents, part)) for part, name in enumerate(names) if parents[part] == above]
     return [f"{name} ({', '.join(inner)})" if inner else name for name, inner in below]
+
+
+def _clothes(dataset: Dataset, arrays: GridArrays | None) -> str:
+    """How many identities are dressed, and of each number of parts the vertices of skin and garments."""
+    if not dataset.attributes.get("labelled") or arrays is None:
+        return ""
+    labels = [dataset.part(identity) for identity in range(len(arrays.topologies))]
+    counts = [np.bincount(its) for its in labels if its is not None]
+    words = [f"{len(counts)} identities are dressed"]
+    for parts in sorted({len(its) for its in counts}):
+        alike = np.array([its for its in counts if len(its) == parts])
+        spans = (f"{low:,}" if low == high else f"{low:,} to {high:,}"
+                 for low, high in zip(alike.min(axis=0).tolist(), alike.max(axis=0).tolist(), strict=True))  # fmt: skip
+        named = ", ".join(f"{part_name(part)} {span}" for part, span in enumerate(spans))
+        words.append(f"{len(alike)} in {parts - 1} {'garments' if parts > 2 else 'garment'} (vertices: {named})")
+    return "; ".join(words)
 
 
 def _growth(recipe: DatasetRecipe) -> str:

@@ -18,7 +18,6 @@ import numpy as np
 import scipy.sparse
 from filelock import FileLock
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from datagen.bodies.anny.identities import Population, draw_local_changes, draw_uniform
 from datagen.bodies.anny.rigs import Bones, t_pose_corrections
@@ -77,16 +76,6 @@ class AnnyModel:
     def world_rotations(self, poses: Poses) -> NDArray[np.float64]:
         """World rotations [pose, bone, 3, 3] of the rig's bones relative to their rest."""
         return poses.on(self._bones.joints, self._bones.parents) @ self._corrections
-
-    def on_the_way(self, poses: Poses, pose: int, shares: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World rotations [share, bone, 3, 3] on the way from the rig's own rest (share 0) to one of ``poses`` (1).
-
-        Every joint turns about the pose's own axis; so does what takes the arms from Anny's A-pose to the T-pose.
-        """
-        way = Poses(poses.joints, poses.parents, shares[:, None, None] * poses.rotations[pose])
-        corrections = Rotation.from_matrix(self._corrections).as_rotvec()
-        partly = Rotation.from_rotvec((shares[:, None, None] * corrections).reshape(-1, 3)).as_matrix()
-        return way.on(self._bones.joints, self._bones.parents) @ partly.reshape(len(shares), -1, 3, 3)
 
     @property
     def corrections(self) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Cloth draped over a moving body: extended position-based dynamics in small steps, in Warp's kernels on the CPU.
 
-Macklin et al. 2016 (XPBD), with one iteration a step (Macklin et al. 2019). Every pose starts at rest and follows a
-fixed path, so that a garment in a pose is a function of identity and pose alone; it has no inertia left at the end.
+Macklin et al. 2016 (XPBD), with one iteration a step (Macklin et al. 2019). Every pose starts at the T-pose and follows
+a fixed path, so that a garment in a pose is a function of identity and pose alone; it has no inertia left at the end.
 """
 
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+import scipy.spatial
 import warp as wp
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from datagen.bodies.clothed.garments import Garment
 from datagen.bodies.clothed.kernels import STEP, Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
 from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
+from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 
 _KEPT, _KEPT_SETTLING = 0.98, 0.9  # of the velocity at each step
@@ -31,18 +33,21 @@ _GRID = 2.0**20
 
 @dataclass(frozen=True)
 class Path:
-    """The way of a body from rest to a pose.
+    """The way of a body from the T-pose, where hands are far from any skirt, to a pose.
 
     Attributes
     ----------
     body
-        Vertices [station, body vertex, 3] float32; the first are those at rest.
+        Vertices [station, body vertex, 3] float32.
     transforms
         Of the bones [station, bone, 3, 4], from rest.
+    cloth
+        Vertices [vertex, 3] float32 of the garment at the first station.
     """
 
     body: NDArray[np.float32]
     transforms: NDArray[np.float64]
+    cloth: NDArray[np.float32]
 
 
 class Cloth:
@@ -52,7 +57,6 @@ class Cloth:
         self._garment, body = garment, worn_by.vertices.astype(np.float32)
         vertices = garment.rest.vertices
         self._edges, self._bends = _springs(garment)
-        _require_outside(vertices, body, faces)
         self._mesh = wp.Mesh(points=_vectors(body), indices=_integers(faces.ravel()))
         self._pins = _pins(garment, worn_by, faces)
         self._skin = _skin_of(garment)
@@ -61,6 +65,7 @@ class Cloth:
             setattr(state, name, _vectors(np.zeros_like(vertices)))
         state.inverse_mass = _numbers(np.where(garment.pinned, 0.0, 1 / _masses(vertices, garment.faces)))
         state.distance = _numbers(garment.distance)
+        state.tether, state.pin = _tethers(garment)
         self._state = state
         starts = np.searchsorted(garment.part, np.arange(1, garment.part[-1] + 2)).tolist()
         below = [garment.faces[garment.part[garment.faces[:, 0]] < number] for number in range(2, len(starts))]
@@ -73,7 +78,7 @@ class Cloth:
     def drape(self, path: Path, solver: DrapeSolver) -> NDArray[np.float32]:
         """Vertices [vertex, 3] at the end of a path, rounded to 2^-20 metres."""
         state = self._state
-        state.place.assign(self._garment.rest.vertices.astype(np.float32))
+        state.place.assign(path.cloth)
         state.velocity.zero_()
         turns = [_of(wp.mat33, transforms[:, :, :3]) for transforms in path.transforms]
         shifts = [_vectors(transforms[:, :, 3]) for transforms in path.transforms]
@@ -110,12 +115,14 @@ def depths(vertices: NDArray[np.float32], body: NDArray[np.float32], faces: NDAr
     return found
 
 
-def _require_outside(vertices: NDArray[np.float64], body: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
-    share = float(np.mean(depths(vertices.astype(np.float32), body, faces) > _DEEP))
+def require_outside(garment: Garment, body: Rest, faces: NDArray[np.int64], *, name: str) -> None:
+    """Refuse a garment (BodyError, which gives it this name) too much of which is inside of the body at rest."""
+    cloth, skin = garment.rest.vertices.astype(np.float32), body.vertices.astype(np.float32)
+    share = float(np.mean(depths(cloth, skin, faces) > _DEEP))
     if share > _MOST_DEEP:
         raise BodyError(
-            f"{share:.0%} of the garment's vertices are more than {1000 * _DEEP:.0f} mm inside of the body at "
-            f"rest, where {_MOST_DEEP:.0%} can be pushed out. Give the parts under data.body.own a larger ease or flare"
+            f"{share:.0%} of the vertices of {name} are more than {1000 * _DEEP:.0f} mm inside of the body at rest, "
+            f"where {_MOST_DEEP:.0%} can be pushed out. Give its parts under data.body.own a larger ease or flare"
         )
 
 
@@ -133,6 +140,21 @@ def _springs(garment: Garment) -> tuple[Any, Any]:
         _springs_of(garment, edges, np.full(len(edges), _STRETCHED), np.full(len(edges), _COMPRESSED)),
         _springs_of(garment, pairs, garment.bending[pairs[:, 0]], garment.bending[pairs[:, 0]]),
     )
+
+
+def _tethers(garment: Garment) -> tuple[Any, Any]:
+    """How far each vertex can be from the nearest pin along edges of cloth, in metres, and which that is.
+
+    Long range attachments (Kim et al. 2012): without them small steps leave fine cloth stretched by its weight.
+    """
+    edges, count = edges_of(garment.faces), len(garment.rest.vertices)
+    if not garment.pinned.any():
+        return _numbers(np.full(count, np.inf)), _integers(np.zeros(count))
+    graph = scipy.sparse.csr_array((garment.lengths(edges), tuple(edges.T)), shape=(count, count))
+    far, _, pins = scipy.sparse.csgraph.dijkstra(
+        graph, directed=False, indices=np.flatnonzero(garment.pinned), return_predecessors=True, min_only=True
+    )
+    return _numbers(far), _integers(np.maximum(pins, 0))
 
 
 def _springs_of(

@@ -56,6 +56,8 @@ class Garment:
     roomy, postures
         Whether each vertex' part [vertex] has room for postures, and vertices [vertex, 3] of all in these, moved as
         skin moves.
+    uneased
+        Vertices [vertex, 3] at rest before they were moved out: in hollows, such as armpits, that crowds them.
     """
 
     rest: Rest
@@ -67,6 +69,7 @@ class Garment:
     distance: NDArray[np.float64]
     bending: NDArray[np.float64]
     roomy: NDArray[np.bool_]
+    uneased: NDArray[np.float64]
     postures: tuple[NDArray[np.float32], ...] = ()
 
     def lengths(self, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -74,8 +77,8 @@ class Garment:
 
         A pattern gives way up to 1.3 times, and only that of tights: skirts are wide by their flare.
         """
-        here, *others = (_apart(np.asarray(its, np.float64), pairs) for its in (self.rest.vertices, *self.postures))
-        needed = np.max([here, *others], axis=0)
+        here = np.maximum(_apart(self.rest.vertices, pairs), _apart(self.uneased, pairs))
+        needed = np.max([here, *(_apart(np.asarray(its, np.float64), pairs) for its in self.postures)], axis=0)
         return np.where(self.roomy[pairs[:, 0]], np.minimum(needed, _ROOM * here), here)
 
 
@@ -193,6 +196,7 @@ def garment_of(figure: Figure, outfit: Sequence[GarmentPart], *, ease: float, su
         distance=np.concatenate([its.distance for its in parts]),
         bending=np.concatenate([its.bending for its in parts]),
         roomy=np.concatenate([its.roomy for its in parts]),
+        uneased=np.concatenate([its.uneased for its in parts]),
     )
 
 
@@ -230,6 +234,7 @@ def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide
         distance=np.full(len(vertices), distance),
         bending=np.full(len(vertices), _BENDING[part.stiffness]),
         roomy=np.full(len(vertices), part.group == "tights"),
+        uneased=vertices,
     )
 
 

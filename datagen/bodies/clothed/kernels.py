@@ -21,7 +21,7 @@ class State:
     """Vertices of cloth: place, place a step ago, velocity, 1 / mass, and planes that each stays outside of.
 
     It keeps ``distance`` from the body's (``contact``, ``normal``), and ``_GAP`` from that of the parts below
-    (``under``, ``under_normal``); a normal is zero where there is nothing near.
+    (``under``, ``under_normal``); a normal is zero where there is nothing near. It is at most ``tether`` from ``pin``.
     """
 
     place: wp.array(dtype=wp.vec3)
@@ -33,6 +33,8 @@ class State:
     normal: wp.array(dtype=wp.vec3)
     under: wp.array(dtype=wp.vec3)
     under_normal: wp.array(dtype=wp.vec3)
+    tether: wp.array(dtype=wp.float32)
+    pin: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -151,6 +153,17 @@ def _project(springs: Springs, state: State):
 
 
 @wp.func
+def _hold(state: State):
+    """Bring vertices that are further from their pin than cloth reaches back to where it does."""
+    for vertex in range(state.place.shape[0]):
+        pin = state.place[state.pin[vertex]]
+        apart = state.place[vertex] - pin
+        length = wp.length(apart)
+        if length > state.tether[vertex] and state.inverse_mass[vertex] > 0.0:
+            state.place[vertex] = pin + apart * (state.tether[vertex] / length)
+
+
+@wp.func
 def _kept_off(place: wp.vec3, before: wp.vec3, plane: wp.vec3, normal: wp.vec3, distance: float, friction: float):
     """The place outside of a plane; what it moved along the plane in this step is less by friction times its depth."""
     depth = distance - wp.dot(place - plane, normal)
@@ -184,6 +197,7 @@ def take_steps(
         for _pass in range(_PASSES):
             _project(edges, state)
         _project(bends, state)
+        _hold(state)
         for vertex in range(state.place.shape[0]):
             place = state.place[vertex]
             before = state.before[vertex]

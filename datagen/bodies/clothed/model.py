@@ -18,7 +18,7 @@ from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody
 
-DRAPING = "1"
+DRAPING = "2"
 """To be raised with any change of outfits, cuts or draping that changes bytes: data of two kinds must not mix."""
 _GRID = 2.0**20
 
@@ -81,7 +81,7 @@ class ClothedModel:
         return np.concatenate([person.skin_faces, garment]).astype(np.int32)
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
-        """Vertices [pose, vertex, 3] float32; each pose is draped from rest, alone."""
+        """Vertices [pose, vertex, 3] float32; each pose is draped from the T-pose, alone."""
         person = self.person(tuple(parameters.tolist()))
         world, garment = self._whole.world_rotations(poses), person.garment
         if self._recipe.method == "skinned":
@@ -98,9 +98,12 @@ class ClothedModel:
         from datagen.bodies.clothed.draping import Path
 
         time = np.arange(self._recipe.solver.frames + 1) / self._recipe.solver.frames
-        world = np.round(self._whole.on_the_way(poses, pose, time * time * (3 - 2 * time)) * _GRID) / _GRID
+        turned = (time * time * (3 - 2 * time))[:, None, None] * poses.rotations[pose]
+        world = self._whole.world_rotations(Poses(poses.joints, poses.parents, turned))
+        world = np.round(world * _GRID) / _GRID
         transforms = part_transforms(world, person.body.joints, person.body.parents)
-        path = Path(skin(person.body, world), np.round(transforms * _GRID) / _GRID)
+        begun = skin(person.garment.rest, world[:1])[0]
+        path = Path(skin(person.body, world), np.round(transforms * _GRID) / _GRID, begun)
         draped: NDArray[np.float32] = person.cloth.drape(path, self._recipe.solver)
         return draped
 
@@ -111,6 +114,14 @@ class ClothedModel:
         rest = Rest(np.empty((0, 3)), person.skin.joints, scipy.sparse.vstack(weights).tocsr(), bones.parents)
         drivers = drivers_of(bones.joints, bones.parents, joints)
         return rig_of(rest, bones.labels, drivers, self._whole.corrections)
+
+    def undressed(
+        self, parameters: NDArray[np.float64], joints: tuple[str, ...]
+    ) -> tuple[Rig, NDArray[np.float64], NDArray[np.int64]]:
+        """The whole body below the clothes: its rig, vertices [v, 3] at Anny's rest, and triangles [f, 3]."""
+        body, bones = self.person(tuple(parameters.tolist())).body, self._whole.bones
+        drivers = drivers_of(bones.joints, bones.parents, joints)
+        return rig_of(body, bones.labels, drivers, self._whole.corrections), body.vertices, body_faces()
 
     def part_labels(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
         """What each vertex [vertex] belongs to: 0 skin, from 1 on the parts of the outfit, innermost first."""
@@ -125,16 +136,16 @@ class ClothedModel:
         garment = garment_of(
             Figure(whole, self._joints), parts, ease=ease, subdivide=solver.subdivide, detail=self._recipe.detail
         )
+        body = _some(whole, np.arange(BODY_VERTICES))
+        if self._recipe.method == "draped":
+            from datagen.bodies.clothed.draping import require_outside
+
+            require_outside(garment, body, body_faces(), name=f"the outfit {self._recipe.outfits[int(outfit)]!r}")
         postures = tuple(skin(garment.rest, self._whole.world_rotations(_POSTURES)))
         faces = self._shown.faces(np.array(own))
         seen = faces[~covered(Figure(shown, self._joints), parts)[faces].all(axis=1)]
         used, renumbered = np.unique(seen.astype(np.int64), return_inverse=True)
-        return Person(
-            _some(shown, used),
-            renumbered.reshape(-1, 3),
-            _some(whole, np.arange(BODY_VERTICES)),
-            replace(garment, postures=postures),
-        )
+        return Person(_some(shown, used), renumbered.reshape(-1, 3), body, replace(garment, postures=postures))
 
 
 def _anny(recipe: AnnyBody) -> AnnyModel:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies.standins.fit import on_grid
-from datagen.bodies.standins.surface_nets import surface_nets
+from datagen.mesh.surface_nets import surface_nets
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 
 _SPINE = {

@@ -33,10 +33,7 @@ def read_glb(path: Path, geometries: Sequence[str]) -> "GlbContent":
     MeshError
         There are no faces, no such geometry, or several that do not make one body.
     """
-    with path.open("rb") as beginning:
-        if beginning.read(4) != b"glTF":
-            raise ValueError("it does not begin with 'glTF' (a text, or a .gltf by another name?)")
-    scene = Gltf(path)
+    scene = _opened(path)
     nodes = solid_nodes(scene)
     if not nodes:
         raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); pose transfer needs a mesh")
@@ -49,6 +46,13 @@ def read_glb(path: Path, geometries: Sequence[str]) -> "GlbContent":
     if not geometries:
         require_one_body(content.extents, path)
     return content
+
+
+def _opened(path: Path) -> Gltf:
+    with path.open("rb") as beginning:
+        if beginning.read(4) != b"glTF":
+            raise ValueError("it does not begin with 'glTF' (a text, or a .gltf by another name?)")
+    return Gltf(path)
 
 
 def solid_nodes(file: Gltf) -> dict[str, int]:
@@ -341,4 +345,8 @@ def _moved(positions: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArr
     return positions @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-FORMATS = {".glb": Format(read_glb, built_glb)}
+def _names(path: Path) -> tuple[str, ...]:
+    return tuple(solid_nodes(_opened(path)))
+
+
+FORMATS = {".glb": Format(read_glb, built_glb, _names)}

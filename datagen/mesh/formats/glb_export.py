@@ -1,5 +1,7 @@
 """GLB files made from the content of another format."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,32 @@ def built_glb(surface: Surface, vertices: NDArray[np.float64], name: str, stem: 
     """A GLB file of one node. Without normals in the original its shading is smooth: viewers show facets else."""
     draft, left_out = built_draft(surface, len(vertices), name)
     return Encoded(draft.static(vertices), {}, left_out)
+
+
+def parts_draft(faces: NDArray[np.int64], part: NDArray[np.integer], materials: Sequence[Material]) -> Draft:
+    """A file that lacks only positions and normals: a node and a mesh a part, called after its material.
+
+    ``faces`` [face, 3] have the corners of one part each; ``part`` [vertex] are places in ``materials``, of which all
+    are worn. Vertices that are ordered by part come out in their order.
+    """
+    parts = GlbParts({"asset": {"version": "2.0", "generator": "dsffnet"}, "scene": 0})
+    of = np.argsort(part, kind="stable")
+    local = np.empty(len(part), np.int64)
+    blocks = []
+    for number in range(len(materials)):
+        vertices = of[part[of] == number]
+        local[vertices] = np.arange(len(vertices))
+        corners = local[faces[part[faces[:, 0]] == number]].ravel()
+        blocks.append(Block(vertices, [{"attributes": {}, "indices": parts.indices(corners), "material": number}]))
+    parts.json |= {
+        "materials": _materials(tuple(materials), parts)[0],
+        "meshes": [{"name": its.name, "primitives": block.primitives}
+                   for its, block in zip(materials, blocks, strict=True)],
+        "nodes": [{"name": its.name, "mesh": number} for number, its in enumerate(materials)],
+        "scenes": [{"nodes": list(range(len(materials)))}],
+    }  # fmt: skip
+    surface = Surface(faces.ravel(), np.full(len(faces), 3), shading=faces.ravel())
+    return Draft(parts, blocks, surface, np.arange(len(part)), np.arange(len(part)))
 
 
 def built_draft(surface: Surface, count: int, name: str) -> tuple[Draft, list[str]]:

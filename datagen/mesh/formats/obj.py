@@ -71,6 +71,15 @@ class ObjContent:
         objects = ["names of its objects"] if len(self._at[b"o"]) > 1 else []
         return [*self._lost, *objects, *(name for element, name in named.items() if self._at[element])]
 
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """Names of its objects, or of its groups where it is one object or none."""
+        objects, groups = (
+            tuple(dict.fromkeys(name for names in self._section_names(element) for name in names))
+            for element in _SECTIONS
+        )
+        return objects if len(objects) > 1 else groups
+
     def only(self, wanted: Sequence[str]) -> "ObjContent":
         """Return the objects and groups of these names, with the vertices of their faces alone.
 
@@ -361,4 +370,8 @@ def read_obj(path: Path, geometries: Sequence[str]) -> ObjContent:
     return content.only(geometries) if geometries else content
 
 
-FORMATS = {".obj": Format(read_obj, _built)}
+def _names(path: Path) -> tuple[str, ...]:
+    return read_obj(path, ()).sections
+
+
+FORMATS = {".obj": Format(read_obj, _built, _names)}

@@ -137,10 +137,12 @@ class Format:
 
     ``read``: path, and names of the geometries to take, none for all -> :class:`Content`. ``build``: surface, vertices
     [n, 3], the object's name, and the file's stem, None where no files may lie beside it -> :class:`Encoded`.
+    ``names``: path -> names of the geometries that can be taken, of formats that have any.
     """
 
     read: Callable[[Path, Sequence[str]], Content]
     build: Callable[[Surface, NDArray[np.float64], str, str | None], Encoded]
+    names: Callable[[Path], tuple[str, ...]] = lambda _: ()
 
 
 def one_mesh(content: Callable[[bytes, Path], Content]) -> Callable[[Path, Sequence[str]], Content]:

@@ -12,7 +12,6 @@ from datagen.bodies.smpl_family.smpl import joint_names
 from datagen.bodies.standins.fit import fit_regressor, principal_shapes
 from datagen.bodies.standins.quadruped import quadruped
 from datagen.bodies.standins.smpl_format import _ADULTS, _by_joint, _pivots, standin, write_standin
-from datagen.bodies.standins.surface_nets import surface_nets
 from datagen.common.errors import BodyError, StorageError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import edges_of
@@ -129,16 +128,6 @@ def test_animals_of_the_shape_space_keep_their_volume(files: dict[str, Path]) ->
     model, random = read_model(files["smal"]), np.random.default_rng(0)
     bodies = model.template + np.einsum("vcb,nb->nvc", model.shapedirs, random.uniform(-2, 2, (50, 41)))
     assert all(0.02 < volume(body, model.faces) < 0.2 for body in bodies)
-
-
-def test_surface_nets_make_a_sphere() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(-12, 13.0)] * 3, indexing="ij"), axis=-1)
-    cells, faces = surface_nets(np.linalg.norm(grid, axis=-1) - 8.3)
-    radii = np.linalg.norm(cells - 12, axis=1)
-    assert np.abs(radii - 8.3).max() < 0.2
-    assert volume(cells - 12, faces) == pytest.approx(4 / 3 * np.pi * 8.3**3, rel=0.02)
-    edges = edges_of(faces)
-    assert len(cells) - len(edges) + len(faces) == 2
 
 
 def test_principal_shapes_are_those_of_a_known_mixture() -> None:

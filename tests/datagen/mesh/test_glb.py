@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from datagen.common.errors import MeshError
-from datagen.mesh.files import read_mesh_file, write_posed
+from datagen.mesh.files import geometry_names, read_mesh_file, write_posed
 from datagen.mesh.formats import glb
 from datagen.mesh.formats.gltf import Gltf
 from datagen.mesh.sequences import write_animation
@@ -195,6 +195,7 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
         read_mesh_file(path)
     with pytest.raises(MeshError, match="no geometry 'shoe'; it has 'body', 'other'"):
         read_mesh_file(path, geometries=["body", "shoe"])
+    assert geometry_names(path) == ("body", "other")
     read = read_mesh_file(path, geometries=["other"])
     assert len(read.mesh.faces) == 12 and read.name == "other"
     assert write_posed(read, read.mesh.vertices, tmp_path / "box.glb") == ["other geometries: body"]

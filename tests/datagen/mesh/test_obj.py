@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from datagen.common.errors import MeshError
-from datagen.mesh.files import read_mesh_file, write_posed
+from datagen.mesh.files import geometry_names, read_mesh_file, write_posed
 from datagen.mesh.formats.obj import ObjContent, face_lines, vertex_lines
 from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
 
@@ -183,6 +183,8 @@ def test_groups_and_objects_are_chosen_with_what_they_need(tmp_path: Path, line_
     path = golden("cube.obj", tmp_path).with_name("two.obj")
     path.write_bytes(TWO.replace(b"\n", line_end))
     whole = read_mesh_file(path)
+    assert geometry_names(path) == ("body", "tall hat")
+    assert geometry_names(golden("cube.obj", tmp_path)) == ("sides", "rest")  # of one object
     for wanted, faces, rows in (
         (["tall hat"], slice(4, 8), range(4, 8)),
         (["brim"], slice(4, 8), range(4, 8)),

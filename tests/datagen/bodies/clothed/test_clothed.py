@@ -108,11 +108,36 @@ def test_a_body_without_helper_geometry_is_refused() -> None:
 
 
 def test_a_cut_that_leaves_nothing_is_refused() -> None:
-    own = OwnOutfit(name="x", parts=(GarmentPart(low=3, high=2),))
+    own = OwnOutfit(name="x", parts=(GarmentPart(group="skirt", low=3.5),))
     nothing = ClothedBody(body=ALL_AGES, outfits=("x",), own=(own,), method="skinned")
     body = load_body(nothing)
-    with pytest.raises(BodyError, match=r"part 1 of the outfit \(tights, low 3, high 2\) leaves nothing"):
+    with pytest.raises(BodyError, match=r"part 1 of the outfit \(skirt, low 3.5, high none\) leaves nothing"):
         body.faces(identity(body))
+
+
+def test_a_garment_within_the_body_is_refused_when_its_faces_are_asked_for() -> None:
+    narrow = OwnOutfit(name="tube", parts=(GarmentPart(low=0.2, high=2.9, flare=0.8, ease=0),))
+    body = load_body(ClothedBody(body=ALL_AGES, outfits=("tube",), own=(narrow,)))
+    with pytest.raises(BodyError, match=r"of the outfit 'tube' are more than 10 mm inside .* a larger ease or flare$"):
+        body.faces(identity(body))
+
+
+TOP = {"low": 2, "sleeve": 1}
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ({"own": [{"name": "x", "parts": [TOP]}] * 2}, r"own: there is another outfit called so, too: 'x'; choose"),
+        ({"own": [{"name": "tight", "parts": [TOP]}]}, r"own: .* another outfit that comes with the project: 'tight'"),
+        ({"own": [{"name": "x", "parts": [TOP | {"high": 1}]}]}, r"low \(2\) must be below high \(1\): nothing lies"),
+        ({"own": [{"name": "x", "parts": [TOP | {"high": 2}]}]}, r"low \(2\) must be below high \(2\)"),
+        ({"own": [{"name": "x", "parts": [TOP | {"group": "skirt"}]}]}, r"a skirt has no sleeves, but sleeve is 1"),
+    ],
+)
+def test_outfits_of_ones_own_that_make_no_sense_are_refused(body: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        ClothedBody.model_validate(body)
 
 
 @pytest.mark.parametrize(
