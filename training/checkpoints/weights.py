@@ -15,11 +15,11 @@ from typing import Annotated, Any
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save, save_file
 from torch import Tensor, nn
 
 from datagen.common.errors import CheckpointError, reason_of
-from datagen.common.files import open_regular
+from datagen.common.files import open_regular, write_atomically
 from datagen.common.json_files import fault_in
 
 _HEADER, _NAMED_AT_MOST = "dsffnet", 3
@@ -45,12 +45,23 @@ class About(BaseModel):
 
 def write_weights(path: Path, weights: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
     """Write weights by parameter name, and what they are, into one safetensors file."""
-    plain = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
-    header = json.dumps({**about, "tensors_sha256": _digest(plain)})
+    plain, metadata = _with_header(weights, about)
     path.touch()
     mode = path.stat().st_mode  # as the umask says; safetensors' own files nobody but the owner may read
-    save_file(plain, path, metadata={_HEADER: header})  # one key: with more their order, and so the bytes, would vary
+    save_file(plain, path, metadata=metadata)
     path.chmod(stat.S_IMODE(mode))
+
+
+def write_weights_atomically(path: Path, weights: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
+    """The same, through memory: the file appears whole or not at all, and its folder with it (else StorageError)."""
+    plain, metadata = _with_header(weights, about)
+    write_atomically(path, save(plain, metadata=metadata))
+
+
+def _with_header(weights: Mapping[str, Tensor], about: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    plain = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
+    header = json.dumps({**about, "tensors_sha256": _digest(plain)})
+    return plain, {_HEADER: header}  # one key: with more their order, and so the bytes, would vary
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:

@@ -4,15 +4,16 @@ A training triple is (source, target, truth): truth = (target's identity, source
 identity and in pose (DSFFNet, section 4.1). One epoch shows every cell of the training grid once as truth.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError, RecipeError
+from datagen.common.errors import DatasetError
 from datagen.common.seeding import Stream, generator
 from datagen.store import Dataset
+from training.data.order import BatchOrder
 from training.recipes.training import TrainingRecipe
 
 Triples = NDArray[np.integer]
@@ -40,7 +41,7 @@ def order_of(recipe: TrainingRecipe, dataset: Dataset) -> "TripleOrder":
     DatasetError
         See :class:`TripleOrder`.
     """
-    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), recipe.batch, seed=recipe.seed)
+    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=recipe.batch, seed=recipe.seed)
 
 
 def last_step_of(recipe: TrainingRecipe, dataset: Dataset) -> int:
@@ -49,17 +50,11 @@ def last_step_of(recipe: TrainingRecipe, dataset: Dataset) -> int:
 
 
 @dataclass(frozen=True)
-class TripleOrder:
-    """The order of training triples of some identities and poses over a whole run, the same for any number of ranks.
-
-    A batch is rows of one epoch that follow each other. The ranks take runs of it in their order, equal ones where
-    they can, and a rank that accumulates cuts its run into parts: the triples of a step do not depend on either.
-    """
+class TripleOrder(BatchOrder):
+    """The order of training triples of some identities and poses."""
 
     identities: Sequence[int]
     poses: Sequence[int] | NDArray[np.integer]
-    batch: int
-    seed: int
 
     def __post_init__(self) -> None:
         if len(self.identities) < 2 or len(self.poses) < 2:
@@ -76,54 +71,11 @@ class TripleOrder:
 
     @property
     def cells(self) -> int:
-        """Triples of an epoch, those that fill no whole batch at its end included."""
         return len(self.identities) * len(self.poses)
 
-    @property
-    def steps_per_epoch(self) -> int:
-        """Whole batches of an epoch."""
-        return self.cells // self.batch
-
-    def batches(self, *, first_step: int, rank: int = 0, ranks: int = 1, parts: int = 1) -> Iterator[list[Triples]]:
-        """This rank's share of every batch from ``first_step`` on, without end: ``parts`` arrays [triple, 4].
-
-        Raises
-        ------
-        RecipeError
-            The batch has fewer triples than there are ranks and parts.
-        """
-        return self._shares(first_step, self._cuts(rank=rank, ranks=ranks, parts=parts))
-
-    def places(self, *, rank: int = 0, ranks: int = 1, parts: int = 1) -> list[int]:
-        """Place in the whole batch of the first triple of each part of a rank's share; the same in every step."""
-        return [start for start, _ in self._cuts(rank=rank, ranks=ranks, parts=parts)]
-
-    def share(self, *, rank: int = 0, ranks: int = 1) -> float:
-        """How much more of a batch this rank has than the mean rank: 1 where the batch is shared equally."""
-        ((start, stop),) = self._cuts(rank=rank, ranks=ranks, parts=1)
-        return (stop - start) * ranks / self.batch
-
-    def _cuts(self, *, rank: int, ranks: int, parts: int) -> list[tuple[int, int]]:
-        """First place of each part, and the place after its last; sizes differ by one at most."""
-        if self.batch < ranks * parts:
-            raise RecipeError(
-                f"training.batch {self.batch} is too small to be shared by {ranks} ranks in {parts} parts each; "
-                f"make it {ranks * parts} or more"
-            )
-        mine = np.array_split(np.arange(self.batch), ranks)[rank]
-        return [(int(part[0]), int(part[-1]) + 1) for part in np.array_split(mine, parts)]
-
-    def _shares(self, first_step: int, cuts: list[tuple[int, int]]) -> Iterator[list[Triples]]:
-        epoch, place = divmod(first_step, self.steps_per_epoch)
-        while True:
-            triples = self._numbered(epoch)
-            for first in range(place * self.batch, self.steps_per_epoch * self.batch, self.batch):
-                yield [triples[first + start : first + stop] for start, stop in cuts]
-            epoch, place = epoch + 1, 0
-
-    def _numbered(self, epoch: int) -> NDArray[np.int64]:
+    def epoch(self, number: int) -> NDArray[np.int64]:
         """An epoch's triples, by the dataset's numbers of identities and poses."""
         identities, poses = np.asarray(self.identities), np.asarray(self.poses)
-        triples = epoch_triples(identities=len(identities), poses=len(poses), seed=self.seed, epoch=epoch)
+        triples = epoch_triples(identities=len(identities), poses=len(poses), seed=self.seed, epoch=number)
         source, source_pose, target, target_pose = triples.T
         return np.stack([identities[source], poses[source_pose], identities[target], poses[target_pose]], axis=1)

@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from datagen.common.errors import CheckpointError, reason_of
-from datagen.store import Dataset
 from training.checkpoints.checkpoint import Checkpoint, load_checkpoint, read_checkpoint, require_checkpoint
 from training.checkpoints.compat import recipe_of
 from training.checkpoints.state_file import unusable_state
 from training.engine.distributed import Ranks, agreed, decided_by_first, restore_random_state
 from training.engine.state import Job, State, Verdict
+from training.engine.task import Named
 from training.engine.train_step import Learner
 from training.recipes.training import TrainingRecipe
 
@@ -28,7 +28,7 @@ def begin(job: Job, device: torch.device, newest: Checkpoint | None) -> State:
     """
     start = None if newest else weights_to_begin_from(job.recipe, job.ranks)
     spanned = {"steps_per_epoch": job.order.steps_per_epoch, "steps": job.last_step}
-    learner = Learner(job.recipe, job.ranks, device, start=start, **spanned)
+    learner = Learner(job.recipe, job.ranks, device, start=start, task=job.task, **spanned)
     state = State(learner, Verdict(triples=job.recipe.evaluate_triples))
     if newest:
         agreed(job.ranks, lambda: _resume(state, newest, job), what="resume from the newest checkpoint")
@@ -46,8 +46,8 @@ def _resume(state: State, newest: Checkpoint, job: Job) -> None:
     state.step = newest.step
 
 
-def checkpoint_to_resume(recipe: TrainingRecipe, dataset: Dataset, run: Path, ranks: Ranks) -> Checkpoint | None:
-    """Return the newest sound checkpoint of a run, of this recipe and dataset; None where the run has none.
+def checkpoint_to_resume(job: Job) -> Checkpoint | None:
+    """Return the newest sound checkpoint of a job's run, of its recipe and data; None where the run has none.
 
     Raises
     ------
@@ -56,19 +56,19 @@ def checkpoint_to_resume(recipe: TrainingRecipe, dataset: Dataset, run: Path, ra
     """
 
     def newest() -> str | None:
-        checkpoint = load_checkpoint(run)
+        checkpoint = load_checkpoint(job.run)
         return str(checkpoint.path) if checkpoint else None
 
-    path = decided_by_first(ranks, newest)
+    path = decided_by_first(job.ranks, newest)
     if path is None:
         return None
 
     def read() -> Checkpoint:
         checkpoint = read_checkpoint(Path(path))
-        require_same_training(recipe, dataset, run, checkpoint)
+        require_same_training(job.recipe, job.task, job.run, checkpoint)
         return checkpoint
 
-    return agreed(ranks, read, what="resume from the newest checkpoint")
+    return agreed(job.ranks, read, what="resume from the newest checkpoint")
 
 
 def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | None:
@@ -89,9 +89,9 @@ def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | 
 
 
 def require_same_training(
-    recipe: TrainingRecipe, dataset: Dataset, run: Path, checkpoint: Checkpoint, *, section: str = "training"
+    recipe: TrainingRecipe, data: Named, run: Path, checkpoint: Checkpoint, *, section: str = "training"
 ) -> None:
-    """Raise if a run's checkpoint was trained by another recipe or on another dataset.
+    """Raise if a run's checkpoint was trained by another recipe or on other data.
 
     ``section``: where the recipe stands in its workflow's, for the message.
 
@@ -100,9 +100,9 @@ def require_same_training(
     CheckpointError, RecipeError
         It was; the message says what differs.
     """
-    if checkpoint.dataset != dataset.uuid:
+    if checkpoint.dataset != data.uuid:
         raise CheckpointError(
-            f"{run} was trained on dataset {checkpoint.dataset}, not on {dataset.url} ({dataset.uuid}). Choose another "
+            f"{run} was trained on dataset {checkpoint.dataset}, not on {data.url} ({data.uuid}). Choose another "
             f"--out (begin there from these weights with --set {section}.start_from={run}), or add --fresh to start "
             "over"
         )

@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from datagen.common.json_files import fault_in
-from datagen.store import Dataset
-from training.data.triples import TripleOrder, last_step_of, order_of
+from training.data.order import BatchOrder
 from training.engine.distributed import Ranks
+from training.engine.task import Task
 from training.engine.train_step import Learner
 from training.recipes.training import TrainingRecipe
 
@@ -23,19 +23,19 @@ class Job:
     """What is trained, on what, where, and by whom."""
 
     recipe: TrainingRecipe
-    dataset: Dataset
+    task: Task
     run: Path
     ranks: Ranks
 
     @property
-    def order(self) -> TripleOrder:
-        """Of its triples."""
-        return order_of(self.recipe, self.dataset)
+    def order(self) -> BatchOrder:
+        """Of its examples."""
+        return self.task.order
 
     @property
     def last_step(self) -> int:
         """The step at which it ends, unless early stopping ends it before."""
-        return last_step_of(self.recipe, self.dataset)
+        return self.recipe.steps or self.recipe.epochs * self.order.steps_per_epoch
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,10 @@ from torch.nn.parallel import DistributedDataParallel
 
 from training.checkpoints.checkpoint import Checkpoint
 from training.checkpoints.weights import fill_network
-from training.data.batch import Batch
 from training.engine.distributed import Ranks
-from training.engine.objective import objective_of
 from training.engine.optimization.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
+from training.engine.task import Batch, Task
 from training.inference.predict import load_weights
-from training.networks import network_from
 from training.networks.execution import products
 from training.recipes.training import TrainingRecipe
 
@@ -42,6 +40,8 @@ class Learner:
         Where it learns.
     steps_per_epoch, steps
         What the schedule spans.
+    task
+        Whose network learns by which objective.
     start
         Whose weights to begin from instead of random ones.
     """
@@ -54,12 +54,13 @@ class Learner:
         *,
         steps_per_epoch: int,
         steps: int,
+        task: Task,
         start: Checkpoint | None = None,
     ) -> None:
-        self.recipe, self._ranks, self.device = recipe, ranks, device
+        self.recipe, self._ranks, self.device, self._task = recipe, ranks, device, task
         self.dtype = torch.float64 if recipe.precision == "float64" else torch.float32
         torch.manual_seed(recipe.seed)
-        network = network_from(recipe.network)
+        network = task.network()
         if start:
             load_weights(network, start)
         self.network = network.to(device, self.dtype)
@@ -74,11 +75,11 @@ class Learner:
         ``share`` is how much more of the batch this rank has than the mean rank; gradients are averaged over ranks.
         """
         self.optimiser.zero_grad(set_to_none=True)
-        meshes = sum(len(part.source) for part in parts)
+        count = sum(len(part) for part in parts)
         losses: dict[str, Tensor] = {}
         with products(self.recipe.precision), self._accumulation():
             for number, part in enumerate(parts):
-                weight = share * len(part.source) / meshes
+                weight = share * len(part) / count
                 for name, value in self._backward(part, weight, last=number == len(parts) - 1).items():
                     losses[name] = losses[name] + value * weight if number else value * weight
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.gradient_clip or float("inf"))
@@ -123,7 +124,7 @@ class Learner:
     @functools.cached_property
     def model(self) -> nn.Module:
         """The objective that a step calls, averaging gradients over ranks. Made at the first step, after loading."""
-        model = objective_of(self.network, self.recipe, self.device)
+        model = self._task.objective(self.network, self.device)
         return DistributedDataParallel(model) if self._ranks.count > 1 else model
 
     def _in_step_with_others(self, last: bool) -> contextlib.AbstractContextManager[Any]:

@@ -7,7 +7,7 @@ step), so the state of a run is its weights, its optimiser, the average of its w
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -18,13 +18,8 @@ import torch.distributed as dist
 
 from datagen.common.errors import BudgetSpent, TrainingStopped
 from datagen.common.resources import memory_errors
-from datagen.store import open_dataset
 from training.checkpoints.checkpoint import Checkpoint, is_finished, save_checkpoint
-from training.data.augmentation import Augmentation, Supervise
-from training.data.batch import Batch
 from training.data.cache_policy import room_of
-from training.data.triples import Triples, last_step_of
-from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import (
     Ranks,
     StopRequest,
@@ -40,11 +35,10 @@ from training.engine.distributed import (
     random_state,
 )
 from training.engine.nonfinite import RecentStep, broken_step, stop_for
-from training.engine.objective import supervision_of
+from training.engine.observer import Meter, Observer, observing
 from training.engine.resume import begin, checkpoint_to_resume
 from training.engine.state import Job, State
-from training.engine.step_memory import require_step_memory
-from training.engine.validation import Meter, Observer, observing, require_measurable
+from training.engine.tasks import task_of
 from training.recipes.training import TrainingRecipe, budget_seconds
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}
@@ -126,19 +120,14 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
         if not launched:
             forget_old_stop(run, ranks, before=now)
         with StopRequest(run) as stop:
-            dataset = agreed(ranks, lambda: open_dataset(data), what="open the dataset")
-            newest = checkpoint_to_resume(recipe, dataset, run, ranks)
-            if newest and is_finished(newest, last_step_of(recipe, dataset)):
+            job = Job(recipe, agreed(ranks, lambda: task_of(recipe, data), what="open the dataset"), run, ranks)
+            newest = checkpoint_to_resume(job)
+            if newest and is_finished(newest, job.last_step):
                 return newest.step
-            require_measurable(dataset, recipe)
             room = room_of(device, sharers=ranks.here)
-            agreed(
-                ranks,
-                lambda: require_step_memory(recipe, dataset, room, ranks=ranks.count),
-                what="hold a step in memory",
-            )
+            agreed(ranks, lambda: job.task.check(room, ranks.count), what="hold a step in memory")
             # What learns must be gone before its process group is: see tests/support/one_rank.py.
-            return _learn(Job(recipe, dataset, run, ranks), device, stop, newest, _deadline(recipe, began or now))
+            return _learn(job, device, stop, newest, _deadline(recipe, began or now))
 
 
 def _deadline(recipe: TrainingRecipe, began: float) -> float:
@@ -153,23 +142,21 @@ def _learn(job: Job, device: torch.device, stop: StopRequest, newest: Checkpoint
     state, meter = begin(job, device, newest), Meter(job.recipe.batch)
     recent: list[RecentStep] = []
     with contextlib.ExitStack() as around:
-        bank = agreed(ranks, lambda: _opened_bank(job, device), what="open the training meshes")
-        around.callback(bank.close)
-        supervise = agreed(ranks, lambda: supervision_of(job.recipe, job.dataset, device), what="read the rigs")
+        feed = around.enter_context(job.task.feed(ranks, device))
         observer = agreed(
             ranks,
-            lambda: around.enter_context(observing(job, state.learner, meter, bank.where)) if ranks.rank == 0 else None,
+            lambda: around.enter_context(observing(job, state.learner, meter, feed.where)) if ranks.rank == 0 else None,
             what="open the run's journal and evaluation triples",
         )
         (told,) = any_rank([stop.made()], ranks)  # while meshes were decoded
         reason = StopReason.TOLD if told else None
-        batches = _batches(job, bank, supervise, state.step)
+        batches = feed.batches(state.step)
         while state.step < job.last_step and reason is None:
             with meter.waiting():
-                triples, parts = next(batches)
+                items, parts = next(batches)
             values = state.learner.step(parts, share=share)
             state.step += 1
-            recent.append((state.step, triples, values["loss/total"]))
+            recent.append((state.step, items, values["loss/total"]))
             due = Due.after(state.step, job.recipe, last_step=job.last_step, check_every=CHECK_EVERY[device.type])
             if due.check:
                 reason = _check(job, state, recent, told=stop.made(), late=time.monotonic() > deadline)
@@ -212,23 +199,6 @@ def _settle(
     return reason
 
 
-def _opened_bank(job: Job, device: torch.device) -> VertexBank:
-    recipe, identities = job.recipe, job.dataset.identities("training")
-    placed: dict[str, Any] = {"device": device, "cache": recipe.cache, "sharers": job.ranks.here}
-    return open_bank(job.dataset, identities, edge_sum=recipe.edge_sum, **placed)
-
-
-def _batches(
-    job: Job, bank: VertexBank, supervise: Supervise, first_step: int
-) -> Iterator[tuple[list[Triples], list[Batch]]]:
-    """This rank's share of every step's triples, in parts, and their meshes on the device."""
-    mine = {"rank": job.ranks.rank, "ranks": job.ranks.count, "parts": job.recipe.accumulate}
-    places, augment = job.order.places(**mine), Augmentation(job.recipe, supervise)
-    for step, share in enumerate(bank.prefetch(job.order.batches(first_step=first_step, **mine)), first_step):
-        parts = zip(share, places, strict=True)
-        yield share, [augment(triples, bank.batch(triples), step=step, first=first) for triples, first in parts]
-
-
 def _save(job: Job, state: State, observer: Observer | None, *, finished: bool, best: bool) -> None:
     """Rank 0 writes a checkpoint, all wait, and a failure to write stops every rank."""
     random, learner = gathered(random_state(), job.ranks), state.learner
@@ -237,8 +207,8 @@ def _save(job: Job, state: State, observer: Observer | None, *, finished: bool, 
         "last_step": job.last_step,
         "finished": finished,
         "recipe": job.recipe.model_dump(mode="json"),
-        "dataset": job.dataset.uuid,
-        "dataset_sha256": job.dataset.attributes["manifest_sha256"],
+        "dataset": job.task.uuid,
+        "dataset_sha256": job.task.sha256,
     }
 
     def write() -> None:

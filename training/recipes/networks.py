@@ -89,6 +89,49 @@ class PartsRecipe(Frozen):
         return joints
 
 
+class TemplateRecipe(Frozen):
+    """FITE's implicit template of an outfit; the defaults are the released sizes (465,708 parameters)."""
+
+    name: Literal["template"] = "template"
+    width: int = Field(256, ge=8, description="channels of the hidden layers")
+    points: int = Field(5625, ge=8, description="points around each scan that a step takes, others each time")
+    hand_points: int = Field(500, ge=1, description="points around the body's hands that a step takes")
+
+
+class AvatarRecipe(Frozen):
+    """FITE's point avatar; the defaults are the released sizes (9,969,417 parameters beside the points' features)."""
+
+    name: Literal["avatar"] = "avatar"
+    map_size: int = Field(256, ge=16, description="pixels across a position map: a power of two")
+    unet_width: int = Field(16, ge=1, description="channels after the first level of the pose encoders")
+    hidden_width: int = Field(256, ge=1, description="channels of the decoder's hidden layers")
+    geometry: int = Field(64, ge=1, description="channels of a point's own features")
+    pose: int = Field(64, ge=4, multiple_of=4, description="channels of a point's pose features, over all four views")
+    normalisation: Literal["group", "batch"] = Field(
+        "group", description="group: nothing depends on batch or ranks; batch: as released"
+    )
+    scan_points: int = Field(20_000, ge=8, description="points of each scan that a step takes, others each time")
+    normals_from: float = Field(
+        0.625, ge=0, le=1, description="share of the training after which normals count (released: 250 of 401 epochs)"
+    )
+    roughness: float = Field(
+        100.0,
+        ge=0,
+        description="weight of metres between a point's offset and the mean of its neighbours'; 0: as released",
+    )
+
+    def sizes(self) -> dict[str, Any]:
+        """Those of the network; the rest says how it is trained."""
+        return self.model_dump(exclude={"name", "scan_points", "normals_from", "roughness"})
+
+    @field_validator("map_size")
+    @classmethod
+    def _halves_to_two(cls, size: int) -> int:
+        if size & (size - 1):
+            raise ValueError(f"map_size must be a power of two, got {size}")
+        return size
+
+
 PEOPLE: dict[str, str | None] = {
     "pelvis": None,
     "left_hip": "pelvis", "right_hip": "pelvis", "spine1": "pelvis",
@@ -106,7 +149,10 @@ PEOPLE: dict[str, str | None] = {
 NETWORK_NAMES = ("dsffnet", "npt", "corenet3d", "parts")
 
 NetworkRecipe = Annotated[
-    Annotated[DsffnetRecipe | NptRecipe | CoreNet3dRecipe | PartsRecipe, Field(discriminator="name")],
+    Annotated[
+        DsffnetRecipe | NptRecipe | CoreNet3dRecipe | PartsRecipe | TemplateRecipe | AvatarRecipe,
+        Field(discriminator="name"),
+    ],
     BeforeValidator(_with_network_name),
 ]
 """The network of a training: one class a network, told apart by ``name``."""

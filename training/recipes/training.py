@@ -10,11 +10,13 @@ from datagen.recipe import Frozen
 from training.recipes.networks import (
     DEFAULT_NETWORK,
     NETWORK_NAMES,
+    AvatarRecipe,
     CoreNet3dRecipe,
     DsffnetRecipe,
     NetworkRecipe,
     NptRecipe,
     PartsRecipe,
+    TemplateRecipe,
 )
 
 __all__ = [
@@ -250,6 +252,7 @@ class TrainingRecipe(Frozen):
                 f"{self.network.name!r}: set augmentation.proportions to 0"
             )
         self._refuse_what_parts_does_not_know()
+        self._refuse_what_avatars_do_not_know()
         if self.early_stopping and self.steps and self.evaluate_every >= self.steps:
             raise ValueError(
                 f"early_stopping {self.early_stopping} goes by evaluations, but with evaluate_every "
@@ -271,6 +274,22 @@ class TrainingRecipe(Frozen):
         for field, is_set in unknown.items():
             if is_set:
                 raise ValueError(f"network 'parts' knows no {field}: take it away")
+
+    def _refuse_what_avatars_do_not_know(self) -> None:
+        if not isinstance(self.network, TemplateRecipe | AvatarRecipe):
+            return
+        unknown = {
+            "precision": self.precision not in ("float32", "float64"),
+            "compile": self.compile,
+            "augmentation": self.augmentation != AugmentationRecipe(),
+        }
+        for field, is_set in unknown.items():
+            if is_set:
+                raise ValueError(f"network {self.network.name!r} knows no {field}: take it away")
+        if isinstance(self.network, AvatarRecipe) and self.network.normalisation == "batch" and self.ranks > 1:
+            raise ValueError(
+                f"network.normalisation 'batch' would be each rank's own, but ranks is {self.ranks}: use 'group'"
+            )
 
     def require_same_learning(self, other: "TrainingRecipe", *, where: str, section: str = "training") -> None:
         """Raise if a run that is to be resumed was trained by another recipe.

@@ -8,6 +8,7 @@ import numpy as np
 from datagen.common.arrays import Floats
 from datagen.grid import POSE_TYPES, SPLITS, Grid
 from datagen.mesh.geometry import bounding_box
+from datagen.mesh.parts import part_colors
 from datagen.store import Dataset
 from training.viz.mesh_grid import contact_sheet
 
@@ -16,7 +17,7 @@ def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, pos
     """Draw some identities (rows) in some poses (columns), spread over both splits, both kinds of poses, and all steps.
 
     The first step is the recipe's own grid, the others are what was appended. Meshes that the dataset does not hold,
-    training identities in unseen poses, are named as such.
+    training identities in unseen poses, are named as such. Dressed people are coloured by part.
     """
     grid = dataset.grid
     rows, columns = chosen(identity_groups(grid), identities), chosen(pose_groups(grid), poses)
@@ -24,7 +25,9 @@ def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, pos
     before = grid.steps[0].training + grid.steps[0].evaluation, grid.steps[0].seen + grid.steps[0].unseen
     labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}" for i in rows]
     headings = [f"pose {p}\n{grid.pose_type(p)}{_appended(p, before[1])}" for p in columns]
-    return contact_sheet(meshes, [dataset.faces(i) for i in rows], labels, headings, path)
+    parts = [dataset.part(identity) for identity in rows]
+    colors = [None if part is None else part_colors(part) / 255 for part in parts]
+    return contact_sheet(meshes, [dataset.faces(i) for i in rows], labels, headings, path, colors_per_row=colors)
 
 
 def identity_groups(grid: Grid) -> list[range]:

@@ -46,6 +46,8 @@ def progress_line(
         "step": f"step {step:,}/{steps:,}",
         "loss": _said("loss {:.4g}", row.get("loss/total")),
         "pmd": _said("PMD unseen {:.1f}e-4", None if pmd is None else pmd * 1e4),
+        "plane": _said("{:.1f} mm to the plane", row.get("evaluation/plane_unseen")),
+        "iou": _said("IoU {:.2f}", row.get("evaluation/iou_unseen")),
         "best": f"best {best * 1e4:.1f}e-4" if pmd is not None and best is not None and best < pmd else "",
         "meshes": _said("{:,.0f} meshes/s", row.get("meshes_per_second")),
         "wait": f"input wait {wait:.0%}" if wait > 0.02 else "",

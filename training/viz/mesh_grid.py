@@ -30,6 +30,7 @@ def contact_sheet(
     column_labels: Sequence[str],
     path: str | os.PathLike[str],
     *,
+    colors_per_row: Sequence[npt.ArrayLike | None] | None = None,
     panel: tuple[int, int] = (210, 250),
 ) -> Path:
     """Draw a grid of meshes, identities down and poses across, all on one scale.
@@ -42,11 +43,16 @@ def contact_sheet(
         The triangles of each row.
     row_labels, column_labels : sequence of str
     path : path of the PNG to write
+    colors_per_row : sequence of arrays [v, 3] in 0..1, or None
+        sRGB of each row's vertices; None where the row has a hue of its own.
     panel : (int, int)
         Width and height of a panel in pixels.
     """
-    if not len(grid) == len(faces_per_row) == len(row_labels) or any(len(row) != len(column_labels) for row in grid):
-        raise ValueError("grid, faces_per_row, row_labels and column_labels differ in length")
+    colors = list(colors_per_row or [None] * len(grid))
+    if not len(grid) == len(faces_per_row) == len(row_labels) == len(colors) or any(
+        len(row) != len(column_labels) for row in grid
+    ):
+        raise ValueError("grid, faces_per_row, row_labels, column_labels and colors_per_row differ in length")
     stood = [[None if one is None else standing(np.asarray(one, float)) for one in row] for row in grid]
     solid = [
         Mesh(one, faces) for row, faces in zip(stood, faces_per_row, strict=True) for one in row if one is not None
@@ -58,7 +64,8 @@ def contact_sheet(
     for index, (row, faces) in enumerate(zip(stood, faces_per_row, strict=True)):
         top = 70 + index * panel[1]
         page.text(38, top + panel[1] / 2, row_labels[index], size=7.5, anchor="center", rotation=90, weight="bold")
-        hue = to_rgb(_SHEET_HUES[index % len(_SHEET_HUES)])
+        own = colors[index]
+        hue = to_rgb(_SHEET_HUES[index % len(_SHEET_HUES)]) if own is None else own
         for column, vertices in enumerate(row):
             if vertices is None:
                 middle = 70 + (column + 0.5) * panel[0], top + panel[1] / 2

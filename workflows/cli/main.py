@@ -5,12 +5,13 @@ import re
 import sys
 from collections.abc import Sequence
 
-from workflows.cli import data, demo, runs, studies, submit, transfer, ui
+from workflows.cli import avatar, data, demo, runs, skin, studies, submit, transfer, ui
 from workflows.pipeline.console import guarded
 
 _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
 _COMMANDS = (
-    *data.COMMANDS, *runs.COMMANDS, *studies.COMMANDS, transfer.COMMAND, demo.COMMAND, submit.COMMAND, ui.COMMAND,
+    *data.COMMANDS, *runs.COMMANDS, *studies.COMMANDS, transfer.COMMAND, skin.COMMAND, avatar.COMMAND,
+    demo.COMMAND, submit.COMMAND, ui.COMMAND,
 )  # fmt: skip
 
 

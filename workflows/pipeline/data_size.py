@@ -8,7 +8,7 @@ from datagen.store.objects import is_local, plain
 from datagen.store.schema import check_extent
 from workflows.pipeline.ray_cluster import on_cluster, worker_count
 from workflows.pipeline.stage import say
-from workflows.pipeline.tasks import RAY_FROM_MESHES
+from workflows.pipeline.tasks import ray_from
 
 
 def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, local: bool = False) -> None:
@@ -34,9 +34,11 @@ def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, loc
     """
     if not anew and _is_whole(url):
         return
+    if recipe.body.expected_vertices is None:
+        say(f"generate: loading the body ({recipe.body.family}) to count its vertices")
     one_task = local or on_cluster()  # of a cluster, this machine's memory says nothing of the others'
     size = size_of(recipe, workers=1)
-    if not one_task and size.meshes >= RAY_FROM_MESHES:
+    if not one_task and size.meshes >= ray_from(recipe):
         try:
             size = size_of(recipe, workers=worker_count())
         except RecipeError as error:  # one worker has room

@@ -231,6 +231,20 @@ class SingleRunFolder(WorkflowFolder):
     beside = _Entry("beside", RunFolder)
 
 
+class AvatarFolder(WorkflowFolder):
+    """The folder of ``dsffnet avatar``: scans, what is made of each outfit, its template's training, and the avatar."""
+
+    kind = "avatar"
+    outfits = _file("outfits")
+    templates = _file("templates")
+    run = _Entry("run", RunFolder)
+    evaluation = _Entry("evaluation", EvaluationFolder)
+
+    def template(self, outfit: str) -> RunFolder:
+        """The training of an outfit's template."""
+        return RunFolder(self.templates / outfit)
+
+
 class TrialsFolder(WorkflowFolder):
     """A folder of many trainings on one dataset."""
 

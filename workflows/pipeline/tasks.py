@@ -1,11 +1,13 @@
 """Where tasks run: few of them in this process, many on Ray, which starts when the first of them need it."""
 
+import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
 from datagen.generate import Runner, Task, ensure_shard, inline, ray_runner
+from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset
 from training.evaluation.evaluate import POSE_TYPES, evaluation_list
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
@@ -13,8 +15,18 @@ from workflows.pipeline.ray_cluster import on_cluster, ray_cluster
 
 RAY_FROM_MESHES = 5_000
 """From so many meshes on, Ray is worth its start: that takes some 12 s on two cores, 5,000 meshes here 1 to 5 s."""
+_RAY_FROM_SECONDS = 60
 RAY_FROM_VERTICES = 100_000
 """The same for triples that are measured, by the vertices of their targets: here some 10 s."""
+
+RAY_FROM_FRAMES = 200
+"""The same for frames of a person's scans, whose points are drawn."""
+
+
+def ray_from(recipe: DatasetRecipe) -> int:
+    """From so many meshes of a recipe on Ray is worth its start: fewer where each takes long, as dressed people."""
+    seconds = recipe.body.seconds_a_mesh
+    return min(RAY_FROM_MESHES, math.ceil(_RAY_FROM_SECONDS / seconds)) if seconds else RAY_FROM_MESHES
 
 
 class TaskRunner:
@@ -46,7 +58,8 @@ class TaskRunner:
         if task is not ensure_shard:  # a single one, of what comes before the shards
             return self._run(task, arguments, here=not on_cluster())
         meshes = sum(shard.rows for _, _, shard, committed in arguments if committed is None)
-        here = self._decide("generate", meshes, "meshes", RAY_FROM_MESHES)
+        least = ray_from(arguments[0][1]) if arguments else RAY_FROM_MESHES
+        here = self._decide("generate", meshes, "meshes", least)
         return self._run(task, arguments, here=here)
 
     def measure(self, dataset: Dataset, recipe: EvaluationRecipe) -> Runner:
@@ -55,6 +68,10 @@ class TaskRunner:
         vertices = sum(dataset.vertex_count(int(triple[2])) for triples in listed for triple in triples)
         here = self._decide("evaluate", vertices, "vertices", RAY_FROM_VERTICES)
         return lambda task, arguments: self._run(task, arguments, here=here)
+
+    def frames(self, task: Callable[..., Any], arguments: list[tuple[Any, ...]], *, what: str) -> Iterator[Any]:
+        """Run a task for each of some frames, a second or so each."""
+        return self._run(task, arguments, here=self._decide(what, len(arguments), "frames", RAY_FROM_FRAMES))
 
     def training(self, recipe: TrainingRecipe) -> TrainingRecipe:
         """The recipe with its launcher chosen, and Ray started where that is Ray's."""

@@ -13,6 +13,7 @@ from datagen.common.errors import RecipeError
 from datagen.recipe import ANIMALS, DatasetRecipe, Frozen
 from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
 from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
+from training.recipes.networks import AvatarRecipe, TemplateRecipe
 from training.recipes.training import DEFAULT_NETWORK, EvaluationRecipe, TrainingRecipe
 from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
 from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
@@ -60,6 +61,14 @@ class WorkflowRecipe(Frozen):
         None, description="another training on the same data, measured beside the first; its keys are those of training"
     )
     evaluation: EvaluationRecipe = Field(default_factory=EvaluationRecipe)
+
+    @model_validator(mode="after")
+    def _transfers_poses(self) -> "WorkflowRecipe":
+        for section, training in (("training", self.training), ("beside", self.beside)):
+            if training and isinstance(training.network, _OF_AVATARS):
+                name = training.network.name
+                raise ValueError(f"{section}.network: {name!r} learns from scans of a person: dsffnet avatar train")
+        return self
 
     @model_validator(mode="after")
     def _stops_by_what_there_is(self) -> "WorkflowRecipe":
@@ -135,17 +144,17 @@ def _with_training(values: dict[str, Any], name: str | None) -> dict[str, Any]:
 
 
 @contextmanager
-def recipe_faults(where: str) -> Iterator[None]:
-    """Turn a failed validation into one line a fault: which key, what is wrong, what was given."""
+def recipe_faults(where: str, *, keys: str = "dsffnet recipe --help-all") -> Iterator[None]:
+    """Turn a failed validation into one line a fault: which key, what is wrong, what was given; ``keys`` lists all."""
     try:
         yield
     except ValidationError as error:
         listed: set[str] | None = set() if error.title == WorkflowRecipe.__name__ else None
         faults = faults_text(error, lambda fault: _describe(fault, listed))
-        raise RecipeError(f"recipe {where}: {faults}. All keys: dsffnet recipe --help-all") from error
+        raise RecipeError(f"recipe {where}: {faults}. All keys: {keys}") from error
 
 
-def save_recipe(recipe: WorkflowRecipe, path: Path) -> None:
+def save_recipe(recipe: BaseModel, path: Path) -> None:
     """Write the resolved recipe as YAML."""
     import yaml
 
@@ -165,6 +174,8 @@ def describe_fields(
         sections = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
         if name == "beside":
             sections = []
+        if not recipe:
+            sections = [section for section in sections if section not in _OF_AVATARS]
         if sections == [TrainingRecipe]:
             names = ", ".join(known_trainings())
             yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
@@ -183,6 +194,7 @@ def describe_fields(
             yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
 
 
+_OF_AVATARS = (TemplateRecipe, AvatarRecipe)
 _KINDS = (
     ("data.body", "family", None),
     ("data.poses.distribution", "name", None),

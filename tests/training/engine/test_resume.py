@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from datagen.common.errors import CheckpointError
+from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import Checkpoint, require_checkpoint, save_checkpoint
 from training.checkpoints.folder import manifest_of, write_manifest
 from training.engine.distributed import Ranks
 from training.engine.train_step import Learner
 from training.engine.trainer import train
+from training.engine.transfer.task import TransferTask
 from training.inference.predict import load_trained
 from training.recipes.training import ScheduleRecipe, TrainingRecipe
 from training.tracking.journal import read_journal
@@ -65,7 +67,8 @@ def test_an_optimiser_that_was_not_fused_is_so_after_a_resume(dataset: str, tmp_
     found = require_checkpoint(tmp_path / "run")
     state = found.state()
     state["optimiser"]["param_groups"][0]["fused"] = None
-    learner = Learner(tiny_training(), Ranks(0, 1, 0), torch.device("cpu"), steps_per_epoch=3, steps=8)
+    task = TransferTask(tiny_training(), open_dataset(dataset))
+    learner = Learner(tiny_training(), Ranks(0, 1, 0), torch.device("cpu"), task=task, steps_per_epoch=3, steps=8)
     learner.load(found, state)
     assert learner.optimiser.param_groups[0]["fused"] is True
 

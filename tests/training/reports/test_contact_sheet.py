@@ -25,9 +25,9 @@ def test_unseen_and_appended_poses_are_shown_and_what_is_not_there_is_said(
     dataset = append(url, training=5, seen=12, unseen=6)
     shown: dict[str, list[str]] = {}
 
-    def noted(grid, faces, rows, columns, path):  # type: ignore[no-untyped-def]
+    def noted(grid, faces, rows, columns, path, **more):  # type: ignore[no-untyped-def]
         shown.update(rows=rows, columns=columns, missing=[[one is None for one in row] for row in grid])
-        return drawn(grid, faces, rows, columns, path)
+        return drawn(grid, faces, rows, columns, path, **more)
 
     from training.reports import contact_sheet as module
 

@@ -12,6 +12,7 @@ import ray
 
 from datagen.common.errors import ClusterError
 from datagen.generate import append, generate, inline
+from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
@@ -65,6 +66,12 @@ def test_a_large_one_is_made_on_ray_which_ends_with_the_block(
     again = TaskRunner(local=True)
     generate(tiny_dataset(), str(tmp_path / "y.zarr"), run=again.make_shards)
     assert len(ray_starts) == 3 and "in this process (--local)" in capsys.readouterr().err
+
+
+def test_meshes_that_take_long_are_worth_rays_start_sooner() -> None:
+    dressed = DatasetRecipe.model_validate({"body": {"family": "clothed"}})
+    assert tasks.ray_from(tiny_dataset()) == 5_000
+    assert 20 < tasks.ray_from(dressed) < 200, "a minute of cloth"
 
 
 def test_only_what_is_appended_counts(

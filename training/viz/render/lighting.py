@@ -4,23 +4,13 @@ import numpy as np
 from scipy import ndimage
 
 from datagen.common.arrays import Floats, Integers
+from datagen.mesh.geometry import vertex_normals
 from training.viz.render.camera import Camera, axes_of
 from training.viz.render.rasterizer import rasterise
 
 _SKY_LIGHTS = 20
 _SHADOW_PIXELS = 96
 _GROUND_PIXELS = 96
-
-
-def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
-    """Return area-weighted unit normals [v, 3]; a vertex without area points up."""
-    corners = vertices[faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], flat)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.maximum(length, 1e-30), (0.0, 1.0, 0.0))
 
 
 def openness(vertices: Floats, faces: Integers) -> Floats:

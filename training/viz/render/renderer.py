@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from datagen.common.arrays import Floats, Integers
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, vertex_normals
 from training.viz.look import Look
 from training.viz.render.camera import Camera, MeshLike, checked_vertices, frame
-from training.viz.render.lighting import ground_shade, ground_shadow, lighting, openness, vertex_normals
+from training.viz.render.lighting import ground_shade, ground_shadow, lighting, openness
 from training.viz.render.rasterizer import on_plane, planes, rasterise
 
 __all__ = [

@@ -1,8 +1,4 @@
-"""What a step computes, by kind of network: what of a batch the network is given, and its losses.
-
-An objective is called as ``objective(batch, step=...)`` and returns ``{"total": ..., name: ...}``, of which the total
-has a gradient. It holds the network and is what is wrapped for averaging gradients over ranks.
-"""
+"""What a step computes, by kind of network: what of a batch of triples the network is given, and its losses."""
 
 import torch
 from torch import Tensor, nn

@@ -24,11 +24,6 @@ _PANEL, _MARGIN, _HEAD, _GAP = (230, 260), 16, 84, 10
 _FAR = 2.5  # in the normalised box; networks end in 2 tanh, so only a broken one reaches farther
 
 
-def snapshot_path(run: Path, step: int) -> Path:
-    """RUN/pictures/step-N.png."""
-    return run / "pictures" / f"step-{step:08d}.png"
-
-
 def draw_snapshot(
     network: nn.Module,
     batch: Batch,
@@ -52,7 +47,7 @@ def draw_snapshot(
     faces : array [f, 3]
         Triangles of all its meshes.
     path
-        The PNG to write; see :func:`snapshot_path`.
+        The PNG to write.
     title
         For example ``"step 1,000, PMD unseen 12.3e-4"``.
     examples

@@ -15,9 +15,9 @@ from tests.support.commands import ROOT
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.data.cache_policy import Room
-from training.engine.step_memory import require_step_memory
 from training.engine.train_step import Learner
 from training.engine.trainer import train
+from training.engine.transfer.step_memory import require_step_memory
 from training.evaluation import evaluate as evaluation
 from training.evaluation import measure as measuring
 from training.evaluation.evaluate import Method, evaluate

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from datagen.store import open_dataset
 from training.data.batch import Batch, read_batch
-from training.engine import snapshots
-from training.engine.snapshots import draw_snapshot, snapshot_path
+from training.engine.transfer import snapshots
+from training.engine.transfer.snapshots import draw_snapshot
 from training.reports.plots.training_curve import draw_coefficients
 from training.tracking.journal import Journal
 
@@ -51,8 +51,8 @@ def column(picture: np.ndarray, number: int) -> np.ndarray:
 
 def test_four_columns_and_a_row_an_example(batch: Batch, faces: np.ndarray, tmp_path: Path) -> None:
     network = Returns(batch.truth).train()
-    path = draw_snapshot(network, batch, faces, snapshot_path(tmp_path, 1000), "step 1,000 of $x$", examples=2)
-    assert path == tmp_path / "pictures" / "step-00001000.png"
+    path = draw_snapshot(network, batch, faces, tmp_path / "step-00001000.png", "step 1,000 of $x$", examples=2)
+    assert path == tmp_path / "step-00001000.png"
     picture = drawn(path)
     assert picture.shape == (84 + 2 * 260 + 16, 4 * 230 + 32, 3)
     shapes = [(column(picture, number).max(2) - column(picture, number).min(2)) > 40 for number in range(3)]

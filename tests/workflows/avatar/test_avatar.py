@@ -1,0 +1,217 @@
+"""``dsffnet avatar``: recipes that cannot be are refused in one line; scans become an avatar that is animated."""
+
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from datagen.common.errors import MeshError, RecipeError
+from datagen.poses import JOINTS, PARENTS, Poses
+from datagen.poses.pose_files import write_pose_file
+from tests.support.commands import command
+from tests.support.shapes.outfits import drawn_outfit, stockinged
+from workflows.avatar.animate import poses_of
+from workflows.avatar.evaluate import Measured, markdown
+from workflows.avatar.outfits import is_of, outer_scan
+from workflows.avatar.recipe import known_avatars, load_avatar
+from workflows.avatar.run import run_avatar
+from workflows.pipeline.run_folder import AvatarFolder
+from workflows.pipeline.tasks import TaskRunner
+from workflows.recipe.loader import load_recipe, save_recipe
+
+TINY: dict[str, Any] = {
+    "data": {
+        "body": {
+            "family": "clothed",
+            "body": {"family": "anny", "topology": "notoes_collapse5pc"},
+            "outfits": ["skirt"],
+            "solver": {"subdivide": 0, "frames": 4, "substeps": 2, "settle": 4},
+        },
+        "identities": {"training": 0, "evaluation": 1},
+        "poses": {"seen": 3, "unseen": 1},
+        "triples": {"count": 0},
+    },
+    "field": {"centres": 150, "spacing": 0.06},
+    "scans": {"around": 500, "surface": 2000},
+    "template": {
+        "network": {"name": "template", "width": 32, "points": 200, "hand_points": 50},
+        "batch": 2, "steps": 40, "optimiser": "adam", "schedule": {"name": "constant"}, "device": "cpu",
+    },
+    "cell": 0.06,
+    "avatar": {
+        "network": {"name": "avatar", "map_size": 16, "unet_width": 2, "hidden_width": 16, "geometry": 8, "pose": 8,
+                    "scan_points": 400},
+        "batch": 2, "steps": 8, "optimiser": "adam", "schedule": {"name": "constant"}, "device": "cpu",
+    },
+    "evaluation": {"frames": 1, "samples": 1000, "examples": 1},
+}  # fmt: skip
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump(TINY))
+    return path
+
+
+@pytest.mark.parametrize("name", known_avatars())
+def test_the_recipes_that_come_along_can_be(name: str) -> None:
+    recipe = load_avatar(name)
+    assert recipe.template.network.name == "template" and recipe.avatar.network.name == "avatar"
+    assert recipe.data.identities.evaluation > 0 and recipe.description
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("avatar.network.map_size=100", r"map_size must be a power of two, got 100"),
+        ("field.spacing=9", r"field.spacing"),
+        ("fields.spacing=9", r"unknown key 'fields.spacing'|unknown key 'fields'"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(change: str, said: str, recipe: Path) -> None:
+    with pytest.raises(RecipeError, match=said):
+        load_avatar(str(recipe), [change])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("cell=0.05", r"was made by another recipe: cell differ. Choose another --out, or add --fresh to start over"),
+        ("scans.around=600", r"another recipe: scans differ"),
+        ("data.poses.seed=4", r"another recipe: data differ"),
+        ("avatar.learning_rate=0.5", r"avatar.learning_rate: 0.001 there, 0.5 here"),
+        ("template.network.width=16", r"template.network: "),
+    ],
+)
+def test_another_recipe_in_its_folder_is_refused_before_anything_is_touched(
+    change: str, said: str, recipe: Path, tmp_path: Path
+) -> None:
+    folder = AvatarFolder(tmp_path / "run")
+    folder.path.mkdir()
+    save_recipe(load_avatar(str(recipe)), folder.recipe)
+    before = folder.recipe.read_bytes()
+    with pytest.raises(RecipeError, match=said):
+        run_avatar(load_avatar(str(recipe), [change]), folder.path, TaskRunner(local=True))
+    assert [its.name for its in folder.path.iterdir()] == ["recipe.yaml"] and folder.recipe.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("avatar.compile=true", r"network 'avatar' knows no compile: take it away"),
+        ("template.augmentation.turn=5", r"network 'template' knows no augmentation: take it away"),
+        ("avatar.precision=bfloat16", r"knows no precision"),
+    ],
+)
+def test_keys_without_effect_are_refused(change: str, said: str, recipe: Path) -> None:
+    with pytest.raises(RecipeError, match=said):
+        load_avatar(str(recipe), [change])
+
+
+def test_batch_norm_is_of_one_rank(recipe: Path) -> None:
+    with pytest.raises(RecipeError, match=r"normalisation 'batch' would be each rank's own, but ranks is 2"):
+        load_avatar(str(recipe), ["avatar.network.normalisation=batch", "avatar.ranks=2"])
+
+
+def test_hidden_triangles_of_a_scan_do_not_count() -> None:
+    inner, outer = (trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.5, 0.4))
+    body = replace(stockinged().body, vertices=inner.vertices, faces=inner.faces, weights=np.ones((162, 1)))
+    scans = np.concatenate([inner.vertices, outer.vertices])[None].astype(np.float32)
+    subject = replace(
+        stockinged(),
+        body=body,
+        scans=scans,
+        faces=np.concatenate([inner.faces, outer.faces + 162]),
+        parts=np.repeat([0, 1], 162),
+        transforms=np.eye(3, 4, dtype=np.float32)[None, None],
+    )
+    found = outer_scan(subject, 0)
+    assert len(found.faces) == 320 and found.faces.max() < 162, "the garment within the body is hidden"
+
+
+def test_scans_of_another_dataset_are_made_again(tmp_path: Path) -> None:
+    outfit = drawn_outfit(tmp_path)
+    assert is_of(outfit, "a leg") and not is_of(outfit, "another dataset")
+    outfit.subject_file.write_bytes(b"")
+    assert not is_of(outfit, "a leg")
+
+
+def test_an_avatar_is_no_network_of_transfers() -> None:
+    with pytest.raises(RecipeError, match=r"training.network: 'avatar' learns from scans of a person: dsffnet avatar"):
+        load_recipe("smoke", ["training.network.name=avatar", "training.network.map_size=32"])
+
+
+def test_somebody_must_become_an_avatar(recipe: Path) -> None:
+    with pytest.raises(RecipeError, match=r"data.identities.evaluation is 0, but these are the people"):
+        load_avatar(str(recipe), ["data.identities.evaluation=0", "data.identities.training=2"])
+
+
+def test_sections_learn_what_they_are_called(recipe: Path) -> None:
+    recipe.write_text(yaml.safe_dump(TINY | {"avatar": deepcopy(TINY["template"])}))
+    with pytest.raises(RecipeError, match=r"avatar.network: need 'avatar', not 'template'"):
+        load_avatar(str(recipe))
+
+
+def test_people_without_clothes_are_no_avatars(recipe: Path) -> None:
+    recipe.write_text(yaml.safe_dump(TINY | {"data": {**TINY["data"], "body": {"family": "leg"}}}))
+    with pytest.raises(RecipeError, match=r"learned of dressed people, not of 'leg'; use clothed"):
+        load_avatar(str(recipe))
+
+
+def test_poses_of_a_file_are_taken_as_they_are(tmp_path: Path) -> None:
+    rotations = np.random.default_rng(0).normal(0, 0.2, (5, len(JOINTS), 3))
+    write_pose_file(tmp_path / "poses.npz", Poses(JOINTS, PARENTS, rotations))
+    folder = AvatarFolder(tmp_path)
+    folder.recipe.touch()
+    found = poses_of(folder, tmp_path / "poses.npz", count=9, seed=0)
+    assert np.allclose(found.rotations, rotations)
+    folder.recipe.unlink()
+    with pytest.raises(RecipeError, match=r"is no folder of an avatar. Make one: dsffnet avatar train"):
+        poses_of(AvatarFolder(tmp_path), None, count=9, seed=0)
+
+
+def test_the_table_has_a_row_for_each_method_and_part() -> None:
+    values = {"scan_to_model": 1.26, "model_to_scan": 2, "plane": 3, "normal_angle": 4, "hausdorff": 5}
+    rows = [
+        Measured("skirt", "seen", method, values | {"chamfer": 2.5e-5, "cosine": 0.9}, {0: values, 2: values})
+        for method in ("template + skinning", "avatar")
+    ]
+    text = markdown(rows)
+    assert "| seen | template + skinning | 1.3 | 2.0 | 3.0 | 4.0 | 5.0 | 2.5 | 0.900 |" in text
+    assert text.count("| seen | skin |") == 1 and "| seen | garment 2 |" in text, "parts of the avatar alone"
+
+
+def test_from_scans_to_an_animation(recipe: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = ["avatar", "train", "--recipe", str(recipe), "--out", str(out), "--local"]
+    done = command(*words)
+    assert done.returncode == 0, done.stderr
+    assert (
+        "| unseen | avatar |" in done.stdout and (out / "evaluation" / "figures" / "examples.png").stat().st_size > 1e4
+    )
+    again = command(*words)
+    assert all(
+        f"{stage}: skipped" in again.stdout for stage in ("generate", "outfits", "templates", "avatar", "evaluate")
+    )
+    (out / "outfits" / "skirt" / "template.safetensors").unlink()
+    mended = command(*words)
+    assert mended.returncode == 0 and "templates: finished" in mended.stdout and "avatar: skipped" in mended.stdout
+    walk = command("avatar", "animate", str(out), "-o", str(tmp_path / "walk.glb"), "--stations", "2")
+    assert walk.returncode == 0, walk.stderr
+    assert len(trimesh.load(tmp_path / "walk.glb").geometry) == 1
+    wrong = command("avatar", "animate", str(out), "--outfit", "coat", "-o", str(tmp_path / "walk.glb"))
+    assert wrong.returncode != 0 and "has the outfits skirt: there is no outfit 'coat' in it" in wrong.stderr
+
+
+def test_an_animation_is_a_glb(tmp_path: Path) -> None:
+    from workflows.avatar.animate import animate
+
+    poses = Poses(JOINTS, PARENTS, np.zeros((2, len(JOINTS), 3)))
+    with pytest.raises(MeshError, match=r"an animation is a .glb file, not '.obj'"):
+        animate(AvatarFolder(tmp_path), None, poses, tmp_path / "walk.obj", frames_per_second=24, picture=None)

@@ -1,0 +1,218 @@
+"""How far an avatar is from scans, in millimetres and degrees, and by the released definitions (FITE, ECCV 2022).
+
+Surfaces are compared by area-uniform samples of them. With q the vertices of the model, n theirs normals, g the samples
+of the scan, and nn the nearest sample:
+
+===================  ===========================================================  ========
+scan_to_model        mean over g of the distance to the model's surface           mm
+model_to_scan        mean over q of the distance to the scan's surface            mm
+plane                mean over q of |(g_nn - q) . n_nn|                           mm
+normal_angle         mean over q of the angle between n and n_nn                  degrees
+hausdorff            the largest distance of samples to the other surface         mm
+chamfer              half the sum of both mean squared distances of samples to    diagonal
+                     the other surface, in diagonals of the scan's box            squared
+cosine               half the sum of the absolute values of both mean cosines     none
+                     between normals of samples and of the nearest sample
+===================  ===========================================================  ========
+
+The last two are those of the released code. Figures depend on the number of samples: compare those of one number only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from datagen.common.arrays import Floats, Integers
+from datagen.mesh.geometry import Mesh
+
+_NEAR = 8  # samples whose triangles may be the nearest
+_MM = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Area-uniform samples of a mesh.
+
+    Attributes
+    ----------
+    mesh
+        What was sampled, in metres.
+    points, normals
+        Of the samples ``[n, 3]``; normals are those of their triangles.
+    faces
+        Number of each sample's triangle ``[n]``.
+    """
+
+    mesh: Mesh
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    @classmethod
+    def sampled(cls, mesh: Mesh, count: int, *, seed: int = 0) -> Surface:
+        """Return ``count`` samples of a mesh."""
+        random = np.random.default_rng(seed)
+        corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(across, axis=1)
+        faces = random.choice(len(areas), size=count, p=areas / areas.sum())
+        first, second = np.sqrt(random.random(count)), random.random(count)
+        shares = np.stack([1 - first, first * (1 - second), first * second], axis=1)
+        points = (shares[:, :, None] * corners[faces]).sum(axis=1)
+        return cls(mesh, points, across[faces] / areas[faces, None], faces)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
+
+    def nearest(self, points: Floats) -> NDArray[np.int64]:
+        """The number [p] of the sample that is nearest to each of points ``[p, 3]``."""
+        return np.asarray(self._tree.query(points)[1], np.int64)
+
+    def closest(self, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The triangle [p] nearest to each of points ``[p, 3]``, and where on it, barycentric ``[p, 3]``.
+
+        Of the triangles of the eight nearest samples, so that it is exact where samples are dense.
+        """
+        near = self.faces[self._tree.query(points, min(_NEAR, len(self.points)))[1]].reshape(len(points), -1)
+        corners = np.asarray(self.mesh.vertices, np.float64)[self.mesh.faces[near]]
+        shares = _closest_on_triangle(points[:, None], corners)
+        away = np.linalg.norm((shares[..., None] * corners).sum(axis=2) - points[:, None], axis=2)
+        best = away.argmin(axis=1)[:, None]
+        return np.take_along_axis(near, best, 1)[:, 0], np.take_along_axis(shares, best[..., None], 1)[:, 0]
+
+    def distances(self, points: Floats) -> NDArray[np.float64]:
+        """Distances [p] of points ``[p, 3]`` from the surface, in metres (:meth:`closest`)."""
+        face, shares = self.closest(points)
+        corners = np.asarray(self.mesh.vertices, np.float64)[self.mesh.faces[face]]
+        away: NDArray[np.float64] = np.linalg.norm((shares[..., None] * corners).sum(axis=1) - points, axis=1)
+        return away
+
+
+@dataclass(frozen=True)
+class AvatarScores:
+    """See the table of :mod:`training.avatar.metrics`; ``parts``: the first four for each part of the scan."""
+
+    scan_to_model: float
+    model_to_scan: float
+    plane: float
+    normal_angle: float
+    hausdorff: float
+    chamfer: float
+    cosine: float
+    parts: Mapping[int, tuple[float, float, float, float]]
+
+
+def score(
+    model: Mesh, normals: Floats, scan: Mesh, *, samples: int = 20_000, parts: Integers | None = None, seed: int = 0
+) -> AvatarScores:
+    """Return how far a model is from a scan.
+
+    Parameters
+    ----------
+    model, scan
+        In metres, in one frame.
+    normals
+        At the model's vertices ``[n, 3]``, of length one.
+    samples
+        Of each surface.
+    parts
+        Label ``[vertex]`` of each of the scan's vertices; what is nearest to a part counts as of it. None: no parts.
+    """
+    of_model, of_scan = (Surface.sampled(mesh, samples, seed=seed) for mesh in (model, scan))
+    vertices = np.asarray(model.vertices, np.float64)
+    here = of_scan.nearest(vertices)
+    plane = np.abs(((of_scan.points[here] - vertices) * of_scan.normals[here]).sum(axis=1))
+    angle = np.degrees(np.arccos(np.clip((of_scan.normals[here] * normals).sum(axis=1), -1, 1)))
+    reached, away = of_model.distances(of_scan.points), of_scan.distances(vertices)
+    of_part = dict[int, tuple[float, float, float, float]]()
+    if parts is not None:
+        labels = parts[np.asarray(scan.faces)[of_scan.faces, 0]]
+        for part in np.unique(labels).tolist():
+            own, its = labels == part, labels[here] == part
+            of_part[part] = (_mm(reached[own]), _mm(away[its]), _mm(plane[its]), _mean(angle[its]))
+    there = of_scan.distances(of_model.points)
+    diagonal = float(np.linalg.norm(np.ptp(np.asarray(scan.vertices, np.float64), axis=0)))
+    return AvatarScores(
+        scan_to_model=_mm(reached),
+        model_to_scan=_mm(away),
+        plane=_mm(plane),
+        normal_angle=_mean(angle),
+        hausdorff=_MM * float(max(reached.max(), there.max())),
+        chamfer=float((reached**2).mean() + (there**2).mean()) / (2 * diagonal**2),
+        cosine=(abs(_mean_cosine(of_scan, of_model)) + abs(_mean_cosine(of_model, of_scan))) / 2,
+        parts=of_part,
+    )
+
+
+def footprint_drift(points: Sequence[Floats], scans: Sequence[Mesh], rest: Floats) -> NDArray[np.float64]:
+    """How far each point [n] slides over the surface between poses, in metres: the corresponding error.
+
+    A point's footprint in a pose is the nearest place of the scan's surface, carried to ``rest``. Simulated scans share
+    their vertices, so that footprints of one point in all poses can be compared; those of a point that stays where it
+    is on the cloth are one. The mean over poses of the distance from their mean.
+
+    Parameters
+    ----------
+    points
+        Of the model in each pose ``[n, 3]``.
+    scans
+        In the same poses, with the same faces.
+    rest
+        The scans' vertices ``[vertex, 3]`` in one pose, in which footprints are compared.
+    """
+    prints = np.stack([_footprints(its, scan, rest) for its, scan in zip(points, scans, strict=True)])
+    drift: NDArray[np.float64] = np.linalg.norm(prints - prints.mean(axis=0), axis=2).mean(axis=0)
+    return drift
+
+
+def _footprints(points: Floats, scan: Mesh, rest: Floats) -> NDArray[np.float64]:
+    face, shares = Surface.sampled(scan, 4 * len(scan.faces)).closest(points)
+    return (shares[..., None] * np.asarray(rest, np.float64)[scan.faces[face]]).sum(axis=1)
+
+
+def _closest_on_triangle(points: Floats, corners: Floats) -> NDArray[np.float64]:
+    """Barycentric coordinates [..., 3] of the places on triangles [..., 3, 3] that are nearest to points [..., 3].
+
+    That of the plane where it lies within the triangle, and else the nearest of its three sides'.
+    """
+    first, second, third = (corners[..., corner, :] for corner in range(3))
+    along, beside, to = second - first, third - first, points - first
+    aa, ab, bb = (along**2).sum(-1), (along * beside).sum(-1), (beside**2).sum(-1)
+    pa, pb = (to * along).sum(-1), (to * beside).sum(-1)
+    area = np.maximum(aa * bb - ab**2, 1e-30)
+    two, three = (bb * pa - ab * pb) / area, (aa * pb - ab * pa) / area
+    inner = np.stack([1 - two - three, two, three], axis=-1)
+    sides = np.stack([_on_side(points, corners, start) for start in range(3)], axis=-2)
+    places = (sides[..., None] * corners[..., None, :, :]).sum(-2)
+    nearest = ((places - points[..., None, :]) ** 2).sum(-1).argmin(-1)
+    outer = np.take_along_axis(sides, nearest[..., None, None], -2)[..., 0, :]
+    return np.where((inner >= 0).all(-1, keepdims=True), inner, outer)
+
+
+def _on_side(points: Floats, corners: Floats, start: int) -> NDArray[np.float64]:
+    end = (start + 1) % 3
+    side = corners[..., end, :] - corners[..., start, :]
+    along = ((points - corners[..., start, :]) * side).sum(-1) / np.maximum((side**2).sum(-1), 1e-30)
+    share = np.clip(along, 0, 1)
+    found = np.zeros((*share.shape, 3))
+    found[..., start], found[..., end] = 1 - share, share
+    return found
+
+
+def _mean_cosine(one: Surface, other: Surface) -> float:
+    return _mean((one.normals * other.normals[other.nearest(one.points)]).sum(axis=1))
+
+
+def _mm(metres: Floats) -> float:
+    return _MM * _mean(metres)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if values.size else float("nan")

@@ -1,0 +1,159 @@
+"""The template of an outfit: learning it as occupancy, and taking its surface (FITE, Lin et al. 2022, section 3.2)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_logits
+
+from datagen.common.errors import CheckpointError, TrainingError
+from datagen.mesh.geometry import edges_of, vertex_normals
+from datagen.mesh.surface_nets import surface_nets
+from training.avatar.diffusion import SkinningField, box_cells
+from training.avatar.occupancy import FrameSamples
+from training.checkpoints.weights import read_weights, write_weights_atomically
+
+Network = Callable[[Tensor, Tensor], Tensor]
+"""Logits [b, n] from points [b, n, 3] and poses [b, condition] (:class:`training.networks.template`)."""
+_SHARPNESS = 5.0
+_LEAST_SHARE = 0.01  # of the area: smaller pieces are crumbs
+_AT_ONCE = 2**15  # points whose logits are computed together
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """The canonical surface of an outfit, whose vertices are the points of the avatar.
+
+    ``vertices`` [v, 3] float32, metres; ``faces`` [f, 3] int64; unit ``normals`` [v, 3]; ``weights`` [v, bone].
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    normals: Tensor
+    weights: Tensor
+
+    @property
+    def euler_characteristic(self) -> int:
+        """Vertices - edges + faces: two for each closed piece without a handle."""
+        return len(self.vertices) - len(edges_of(self.faces.numpy())) + len(self.faces)
+
+    def save(self, path: Path) -> None:
+        """Write the template as safetensors."""
+        write_weights_atomically(path, vars(self), {"kind": "template"})
+
+    @classmethod
+    def load(cls, path: Path) -> "Template":
+        """Read a template.
+
+        Raises
+        ------
+        CheckpointError
+            The file is missing, damaged, or holds something else.
+        """
+        read = read_weights(path)
+        if read.keys() != {"vertices", "faces", "normals", "weights"}:
+            raise CheckpointError(f"{path} holds no template, but {', '.join(sorted(read)[:5]) or 'nothing'}")
+        return cls(**read)
+
+
+def pose_condition(rotations: NDArray[np.float64]) -> Tensor:
+    """What the network is told of poses [frame, joint, 3]: axis-angles but the root's over pi, [frame, 3 joint - 3]."""
+    return torch.from_numpy(rotations[:, 1:].reshape(len(rotations), -1) / np.pi).float()
+
+
+def plainest_pose(conditions: Tensor) -> Tensor:
+    """The pose [condition] of least L1 norm among some [frame, condition]: the template is extracted under it."""
+    return conditions[conditions.abs().sum(dim=1).argmin()]
+
+
+def template_loss(network: Network, samples: FrameSamples, condition: Tensor, hands: tuple[Tensor, Tensor]) -> Tensor:
+    """Cross entropy of occupancy, of points around scans and, where there are any, around the hands of the body.
+
+    A posed point is occupied by the mean over its roots of sigmoid f, weighted by a softmax of five times themselves.
+    Points without a root are left out. The mean over a frame's points, then over frames. ``samples`` have a leading
+    axis b of frames, as ``condition`` [b, condition]; ``hands``: canonical points [m, 3] and whether they are inside
+    [m].
+    """
+    found = samples.valid.any(dim=2)
+    logits = network(samples.roots.flatten(1, 2), condition).reshape(samples.valid.shape)[found]
+    occupied = logits.sigmoid()
+    scores = (_SHARPNESS * occupied).masked_fill(~samples.valid[found], -torch.inf)
+    mean = (scores.softmax(dim=1) * occupied).sum(dim=1)
+    each = binary_cross_entropy(mean.clamp(1e-6, 1 - 1e-6), samples.inside[found].to(mean), reduction="none")
+    of_frame = each.new_zeros(len(found)).index_add(0, found.nonzero()[:, 0], each) / found.sum(dim=1).clamp(min=1)
+    loss = of_frame.mean()
+    points, inside = hands
+    if not len(points):
+        return loss
+    on_hands = network(points.expand(len(condition), -1, -1), condition)
+    return loss + binary_cross_entropy_with_logits(on_hands, inside.to(on_hands).expand_as(on_hands))
+
+
+@torch.no_grad()
+def near_surface_iou(network: Network, samples: FrameSamples, condition: Tensor) -> float:
+    """Intersection over union of what is inside and what is said to be, among the points near the surfaces of scans.
+
+    A point is occupied if the network says so of any of its roots; one without a root is outside. Arguments as in
+    :func:`template_loss`.
+    """
+    logits = network(samples.roots.flatten(1, 2), condition).reshape(samples.valid.shape)
+    occupied = ((logits > 0) & samples.valid).any(dim=2)[samples.near]
+    inside = samples.inside[samples.near]
+    return float((occupied & inside).sum() / (occupied | inside).sum())
+
+
+def extract_template(network: Network, condition: Tensor, field: SkinningField, *, cell: float = 0.015) -> Template:
+    """The surface where the logit is zero under a pose, within the field's box.
+
+    Parameters
+    ----------
+    condition
+        The pose [condition] (:func:`plainest_pose`).
+    cell
+        Metres between places at which the network is asked, which is about how far vertices lie from one another: for
+        a person 15 mm give some 13,000 vertices, 7 mm 55,000.
+
+    Raises
+    ------
+    TrainingError
+        The network has no surface in the box.
+    """
+    counts = np.ceil((field.high - field.low).numpy() / cell).astype(int).clip(3)
+    places = torch.from_numpy(box_cells(field.low.numpy(), field.high.numpy(), tuple(counts.tolist()))).float()
+    logits = _logits(network, places.reshape(-1, 3), condition).reshape(places.shape[:3]).numpy().transpose(2, 1, 0)
+    outside = np.full(logits.shape, np.abs(logits).max())
+    outside[1:-1, 1:-1, 1:-1] = -logits[1:-1, 1:-1, 1:-1]
+    if not (outside < 0).any():
+        raise TrainingError("the template has no surface: nothing is occupied in the field's box. Train for longer")
+    at, faces = surface_nets(outside.astype(np.float64))
+    edge = ((field.high - field.low).numpy() / counts).astype(np.float64)
+    vertices, faces = _large_pieces(field.low.numpy() + (at + 0.5) * edge, faces)
+    points = torch.from_numpy(vertices).float()
+    normals = torch.from_numpy(vertex_normals(vertices, faces)).float()
+    return Template(points, torch.from_numpy(faces), normals, field.weights(points))
+
+
+@torch.no_grad()
+def _logits(network: Network, points: Tensor, condition: Tensor) -> Tensor:
+    firsts = range(0, len(points), _AT_ONCE)
+    return torch.cat([network(points[None, first : first + _AT_ONCE], condition[None])[0] for first in firsts])
+
+
+def _large_pieces(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The connected pieces of a surface that have more than a hundredth of its area."""
+    first, second, third = faces.T
+    links = np.concatenate([first, second]), np.concatenate([second, third])
+    joined = scipy.sparse.coo_array((np.ones(len(links[0])), links), shape=(len(vertices),) * 2)
+    piece = scipy.sparse.csgraph.connected_components(joined, directed=False)[1][first]
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    kept = (np.bincount(piece, area) > _LEAST_SHARE * area.sum())[piece]
+    used, renumbered = np.unique(faces[kept], return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3)

@@ -1,0 +1,131 @@
+"""The outfits of an avatar together: their templates, what the network is given of a pose, and the posed meshes."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh
+from training.avatar.maps import PositionMaps, Views
+from training.avatar.outfit import Outfit
+from training.avatar.subject import Subject
+from training.avatar.template import Template
+from training.networks.avatar import Avatar, PointAvatar
+from training.networks.avatar import Template as Points
+from training.objectives.point_losses import Edges
+from training.recipes.networks import AvatarRecipe
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """An avatar in a pose: the points as a mesh with their normals [n, 3], and the stages that lead there [n, 3].
+
+    ``transforms`` [bone, 3, 4] of the pose, from the canonical one.
+    """
+
+    mesh: Mesh
+    normals: Floats
+    skinned: Floats
+    corrected: Floats
+    transforms: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Wardrobe:
+    """Subjects and templates by outfit, in one order.
+
+    Parameters
+    ----------
+    subjects, templates
+        Of the outfits.
+    network
+        Sizes of the network.
+    """
+
+    subjects: tuple[Subject, ...]
+    templates: tuple[Template, ...]
+    recipe: AvatarRecipe
+
+    @classmethod
+    def of(cls, outfits: Sequence[Outfit], recipe: AvatarRecipe) -> "Wardrobe":
+        """Read the outfits' folders.
+
+        Raises
+        ------
+        CheckpointError
+            A file is missing or damaged.
+        """
+        return cls(tuple(its.subject() for its in outfits), tuple(its.template() for its in outfits), recipe)
+
+    @cached_property
+    def views(self) -> Views:
+        """From which the templates are drawn."""
+        return Views.of([its.vertices.double().numpy() for its in self.templates])
+
+    @cached_property
+    def _maps(self) -> tuple[PositionMaps, ...]:
+        return tuple(
+            PositionMaps(self.views, _mesh(its), its.weights, size=self.recipe.map_size) for its in self.templates
+        )
+
+    def to(self, device: torch.device) -> "Wardrobe":
+        """Move what makes maps to a device, in place, and return this."""
+        for maps in self._maps:
+            maps.to(device)
+        return self
+
+    def edges(self) -> list[Edges]:
+        """Of the templates."""
+        return [Edges.of(its.faces.numpy(), len(its.vertices)) for its in self.templates]
+
+    def network(self) -> PointAvatar:
+        """A new avatar of the templates' points."""
+        points = []
+        for template in self.templates:
+            places = self.views.places(template.vertices.double().numpy())[..., :2]
+            points.append(
+                Points(template.vertices, template.normals, template.weights, torch.from_numpy(places).float())
+            )
+        return PointAvatar(points, **self.recipe.sizes())
+
+    def given(self, rows: Sequence[tuple[int, int]]) -> tuple[Tensor, Tensor]:
+        """Maps [b, view, 3, size, size] and transforms [b, bone, 3, 4] of rows (outfit, frame)."""
+        return self.drawn([outfit for outfit, _ in rows], np.stack([self.subjects[o].transforms[f] for o, f in rows]))
+
+    def drawn(self, outfits: Sequence[int], transforms: NDArray[np.floating]) -> tuple[Tensor, Tensor]:
+        """Maps and transforms as :meth:`given`, for any transforms [b, bone, 3, 4] of each outfit's bones."""
+        moved = torch.from_numpy(np.asarray(transforms, np.float32))
+        moved = moved.to(self._maps[0].device)
+        return torch.cat([self._maps[its](moved[row : row + 1]) for row, its in enumerate(outfits)]), moved
+
+    def posed(
+        self, network: nn.Module, rows: Sequence[tuple[int, int]], *, dtype: torch.dtype = torch.float32
+    ) -> Iterator[Posed]:
+        """The avatar in frames (outfit, frame), one after another."""
+        for outfit, frame in rows:
+            (found,) = self.animated(network, outfit, self.subjects[outfit].transforms[frame][None], dtype=dtype)
+            yield found
+
+    @torch.no_grad()
+    def animated(
+        self, network: nn.Module, outfit: int, transforms: NDArray[np.floating], *, dtype: torch.dtype = torch.float32
+    ) -> Iterator[Posed]:
+        """The avatar in an outfit, for each of some transforms [frame, bone, 3, 4] of its bones."""
+        faces = self.templates[outfit].faces.numpy()
+        for moved in transforms:
+            maps, its = self.drawn([outfit], moved[None])
+            avatar: Avatar = network(maps.to(dtype), its.to(dtype), [outfit])
+            points, normals, skinned, displaced = (
+                each.double().cpu().numpy()
+                for each in (avatar.points, avatar.normals, avatar.skinned, avatar.displacements)
+            )
+            yield Posed(Mesh(points, faces), normals, skinned, points - displaced, moved)
+
+
+def _mesh(template: Template) -> Mesh:
+    return Mesh(template.vertices.double().numpy(), template.faces.numpy())

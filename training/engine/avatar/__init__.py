@@ -1,0 +1,1 @@
+"""A person in clothes as tasks of the trainer: the template of an outfit, and the point avatar (FITE)."""

@@ -1,0 +1,41 @@
+"""Frames of subjects in the order that a training shows them, and what is drawn for each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.common.errors import DatasetError
+from datagen.common.seeding import Stream, generator
+from training.data.order import BatchOrder
+
+
+@dataclass(frozen=True)
+class FrameOrder(BatchOrder):
+    """Rows (subject, frame) of the frames that each subject shows; every epoch shows all of them once, mixed."""
+
+    frames: Sequence[Sequence[int]]
+
+    def __post_init__(self) -> None:
+        if self.steps_per_epoch == 0:
+            raise DatasetError(
+                f"there are {self.cells} frames to learn from, fewer than a batch of {self.batch}: make the batch "
+                "smaller, or more poses"
+            )
+
+    @property
+    def cells(self) -> int:
+        return sum(len(its) for its in self.frames)
+
+    def epoch(self, number: int) -> NDArray[np.int64]:
+        rows = np.array([(subject, frame) for subject, its in enumerate(self.frames) for frame in its], np.int64)
+        return generator(self.seed, Stream.TRAINING_TRIPLES, number).permutation(rows)
+
+
+def drawn(seed: int, step: int, place: int, *, of: int, count: int) -> NDArray[np.int64]:
+    """Numbers [count] of what an example takes of ``of`` points, a function of (seed, step, place in the batch)."""
+    return generator(seed, Stream.AUGMENTATION, step * _PLACES + place).choice(of, count, replace=count > of)
+
+
+_PLACES = 2**20

@@ -1,0 +1,155 @@
+"""From a dataset of dressed people to the folders of outfits: body, scans, field, points around and on the scans."""
+
+from collections.abc import Iterator
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from datagen.bodies import load_body
+from datagen.bodies.clothed.model import ClothedModel
+from datagen.common.errors import CheckpointError, UnsafeFileError
+from datagen.common.seeding import Stream, generator
+from datagen.mesh.geometry import Mesh
+from datagen.mesh.rig import skinned
+from datagen.recipe import ClothedBody
+from datagen.store import Dataset
+from training.avatar.body import canonical_body
+from training.avatar.diffusion import SkinningField, diffused_skinning
+from training.avatar.occupancy import HIDDEN_DEPTH, FrameSamples, frame_samples, hand_samples, surface_points
+from training.avatar.outfit import OccupancySamples, Outfit, SurfaceSamples, is_sound
+from training.avatar.solid import Solid
+from training.avatar.subject import Subject, posed_by
+from training.avatar.template import pose_condition
+from training.checkpoints.weights import read_header
+from workflows.avatar.recipe import AvatarWorkflow, FieldRecipe, ScanRecipe
+from workflows.pipeline.progress import bar
+from workflows.pipeline.tasks import TaskRunner
+
+MADE = ("subject_file", "field_file", "samples", "surfaces")
+"""What is made of an outfit before its template is learned, by the names of :class:`training.avatar.outfit.Outfit`."""
+_HAND_POINTS = 5_000
+
+
+def make_outfits(recipe: AvatarWorkflow, dataset: Dataset, folder: Path, tasks: TaskRunner) -> None:
+    """Make the folders of all outfits; a file that is there already was finished, and is kept."""
+    for subject in subjects_of(dataset):
+        outfit = Outfit(folder / subject.name)
+        if not is_of(outfit, dataset.uuid):
+            for name in MADE:
+                getattr(outfit, name).unlink(missing_ok=True)
+            subject.save(outfit.subject_file)
+        if not is_sound(outfit.field_file):
+            _field(recipe.field, subject).save(outfit.field_file)
+        if not (is_sound(outfit.samples) and is_sound(outfit.surfaces)):
+            _draw(recipe.scans, outfit, subject, tasks)
+
+
+def is_of(outfit: Outfit, source: str) -> bool:
+    """Whether an outfit's scans are there, whole, and those of a dataset."""
+    try:
+        return bool(read_header(outfit.subject_file).get("source") == source)
+    except (CheckpointError, UnsafeFileError):
+        return False
+
+
+def subjects_of(dataset: Dataset) -> Iterator[Subject]:
+    """The people of a dataset's evaluation split, each by the name of the outfit; a second one in it gets a number."""
+    body, recipe = load_body(dataset.recipe.body), dataset.recipe.body
+    assert isinstance(body, ClothedModel) and isinstance(recipe, ClothedBody)
+    joints, parents = tuple(dataset.attributes["joints"]), tuple(dataset.attributes["joint_parents"])
+    names = list[str]()
+    for identity in dataset.identities("evaluation"):
+        parameters = dataset.parameters(identity)
+        outfit = recipe.outfits[int(parameters[-2])]
+        numbered = (f"{outfit}-{number}" for number in count(2))
+        names.append(next(name for name in chain([outfit], numbered) if name not in names))
+        rig, vertices, faces = body.undressed(parameters, joints)
+        canonical = canonical_body(rig, vertices, faces, joints, parents)
+        poses = dataset.grid.poses_of(identity)
+        rotations, labels = dataset.rotations()[poses], dataset.part(identity)
+        assert labels is not None
+        yield Subject(
+            name=names[-1],
+            source=dataset.uuid,
+            body=canonical,
+            scans=np.asarray(dataset.vertices(identity, poses), np.float32),
+            faces=dataset.faces(identity).astype(np.int64),
+            parts=labels.astype(np.int64),
+            transforms=posed_by(canonical, rotations, joints, parents),
+            rotations=rotations.astype(np.float32),
+            is_seen=np.isin(poses, dataset.grid.poses("seen")),
+        )
+
+
+def _field(recipe: FieldRecipe, subject: Subject) -> SkinningField:
+    what = f"field of {subject.name}"
+
+    def progress(points: range) -> Iterator[int]:
+        yield from bar(points, total=len(points), what=what, unit="block")
+
+    return diffused_skinning(subject.body, **recipe.model_dump(), progress=progress)
+
+
+def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunner) -> None:
+    frames = len(subject.scans)
+    arguments = [(str(outfit.path), frame, recipe.around, recipe.surface) for frame in range(frames)]
+    found = list(
+        bar(
+            tasks.frames(draw_frame, arguments, what=f"points of {outfit.name}"),
+            total=frames,
+            what=f"points of {outfit.name}",
+            unit="scan",
+        )
+    )
+    around, points, normals = zip(*found, strict=True)
+    least = min(len(its) for its in points)
+    SurfaceSamples(*(torch.stack([its[:least] for its in each]) for each in (points, normals))).save(outfit.surfaces)
+    samples = FrameSamples(*(torch.stack(each) for each in zip(*around, strict=True)))
+    hands, inside = hand_samples(generator(0, Stream.AUGMENTATION), subject.body, _HAND_POINTS)
+    OccupancySamples(
+        **samples._asdict(),
+        conditions=pose_condition(subject.rotations.astype(np.float64)),
+        is_seen=torch.from_numpy(subject.is_seen),
+        hand_points=hands,
+        hand_inside=inside,
+    ).save(outfit.samples)
+
+
+def draw_frame(place: str, frame: int, around: int, surface: int) -> tuple[FrameSamples, torch.Tensor, torch.Tensor]:
+    """Points around a scan, and points and normals of its outer surface; a function of the outfit and the frame."""
+    outfit = Outfit(Path(place))
+    subject, random = outfit.subject(), generator(0, Stream.AUGMENTATION, frame + 1)
+    scan = solid_parts(subject, frame)
+    transforms = subject.transforms[frame].astype(np.float64)
+    samples = frame_samples(random, scan, body=subject.body, field=outfit.field(), transforms=transforms, count=around)
+    points, normals = surface_points(random, scan, surface)
+    return samples, torch.from_numpy(points).float(), torch.from_numpy(normals).float()
+
+
+def solid_parts(subject: Subject, frame: int) -> list[Mesh]:
+    """A scan as the posed body and the parts of the outfit, each a mesh of its own."""
+    body, transforms = subject.body, subject.transforms[frame][None].astype(np.float64)
+    posed = Mesh(skinned(body.vertices, body.weights, transforms)[0], body.faces)
+    garments = [_part(subject, frame, part) for part in range(1, int(subject.parts.max()) + 1)]
+    return [posed, *garments]
+
+
+def _part(subject: Subject, frame: int, part: int) -> Mesh:
+    own: NDArray[Any] = np.flatnonzero(subject.parts == part)
+    faces = subject.faces[(subject.parts[subject.faces] == part).all(axis=1)]
+    return Mesh(subject.scans[frame][own].astype(np.float64), np.searchsorted(own, faces))
+
+
+def outer_scan(subject: Subject, frame: int) -> Mesh:
+    """A scan's mesh without triangles that lie deeper than 4 mm within another part, as those of legs in a skirt."""
+    scan, owner = subject.scan(frame), subject.parts[subject.faces[:, 0]]
+    middles = scan.vertices[scan.faces].mean(axis=1)
+    hidden = np.zeros(len(owner), bool)
+    for part, mesh in enumerate(solid_parts(subject, frame)):
+        others = np.flatnonzero(owner != part)
+        hidden[others] |= Solid(mesh.vertices, mesh.faces).depth(middles[others]) > HIDDEN_DEPTH
+    return Mesh(scan.vertices, scan.faces[~hidden])

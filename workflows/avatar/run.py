@@ -1,0 +1,114 @@
+"""The stages of an avatar: scans, outfits, templates, points, evaluation; finished ones are skipped."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+from datagen.common.errors import CheckpointError, RecipeError
+from datagen.store import open_dataset
+from training.avatar.outfit import is_sound, outfits_in
+from training.avatar.template import extract_template, plainest_pose
+from training.tracking.record import has_record, update_record
+from workflows.avatar.evaluate import evaluate_avatar
+from workflows.avatar.outfits import MADE, is_of, make_outfits
+from workflows.avatar.recipe import AvatarWorkflow, load_avatar
+from workflows.avatar.runs import is_learned, learn, trained
+from workflows.pipeline.generate import generate_stage
+from workflows.pipeline.run_folder import AvatarFolder
+from workflows.pipeline.stage import Stage, once, recorded, run_stage, say
+from workflows.pipeline.tasks import TaskRunner
+from workflows.recipe.loader import save_recipe
+
+
+def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
+    """All stages of a recipe into the folder ``out``."""
+    folder, values = AvatarFolder(out), recipe.model_dump(mode="json")
+    of_outfits = [values[name] for name in ("data", "field", "scans")]
+    of_templates = [*of_outfits, values["template"], values["cell"]]
+    of_points = [*of_templates, values["avatar"]]
+    _refuse_conflicts(recipe, folder)
+    with ExitStack() as around:
+        begin = once(lambda: _begin(around, recipe, folder, tasks))
+        stages = (
+            generate_stage(recipe.data, folder, tasks),
+            Stage(
+                "outfits",
+                depends_on=of_outfits,
+                intact=lambda: _are_sound(recipe, folder, *MADE),
+                work=lambda: make_outfits(recipe, open_dataset(folder.data), folder.outfits, tasks),
+            ),
+            Stage(
+                "templates",
+                depends_on=of_templates,
+                intact=lambda: _are_sound(recipe, folder, "template_file"),
+                work=lambda: _learn_templates(recipe, folder, tasks),
+            ),
+            Stage(
+                "avatar",
+                depends_on=of_points,
+                intact=lambda: is_learned(recipe.avatar, folder.outfits, folder.run),
+                work=lambda: learn(recipe.avatar, folder.outfits, folder.run, parent=out, tasks=tasks, name="avatar"),
+            ),
+            Stage(
+                "evaluate",
+                depends_on=[*of_points, values["evaluation"]],
+                intact=lambda: folder.evaluation.tables.exists() and has_record(folder.evaluation.path),
+                work=lambda: evaluate_avatar(recipe.evaluation, folder),
+            ),
+        )
+        for stage in stages:
+            run_stage(stage, out=out, before=begin)
+
+
+def _begin(around: ExitStack, recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner) -> None:
+    out, parameters = folder.path, recipe.model_dump(mode="json")
+    save_recipe(recipe, folder.recipe)
+    around.enter_context(recorded(out, kind=folder.kind, name=out.name, parent=None, parameters=parameters))
+    update_record(out, artifacts=["recipe.yaml"])
+    around.enter_context(tasks)
+
+
+def _refuse_conflicts(recipe: AvatarWorkflow, folder: AvatarFolder) -> None:
+    """Refuse a recipe that another one's work lies in the folder of, before anything there is touched.
+
+    Raises
+    ------
+    RecipeError
+        What is made or learned would differ; how often to log, where to run and what to evaluate may.
+    """
+    if not folder.recipe.exists():
+        return
+    there = load_avatar(str(folder.recipe))
+    changed = [name for name in ("data", "field", "scans", "cell") if getattr(recipe, name) != getattr(there, name)]
+    if changed:
+        raise RecipeError(
+            f"{folder.path} was made by another recipe: {', '.join(changed)} differ. Choose another --out, or add "
+            "--fresh to start over"
+        )
+    recipe.template.require_same_learning(there.template, where=str(folder.path), section="template")
+    recipe.avatar.require_same_learning(there.avatar, where=str(folder.path), section="avatar")
+
+
+def _are_sound(recipe: AvatarWorkflow, folder: AvatarFolder, *files: str) -> bool:
+    try:
+        outfits = outfits_in(folder.outfits)
+    except CheckpointError:
+        return False
+    source = open_dataset(folder.data).uuid
+    whole = all(is_of(its, source) and is_sound(getattr(its, file)) for its in outfits for file in files)
+    return whole and len(outfits) == recipe.data.identities.evaluation
+
+
+def _learn_templates(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner) -> None:
+    for outfit in outfits_in(folder.outfits):
+        run = folder.template(outfit.name)
+        learn(recipe.template, outfit.path, run, parent=folder.path, tasks=tasks, name=f"template {outfit.name}")
+        network = trained(recipe.template, outfit.path, run, section="template")
+        samples = outfit.occupancy_samples()
+        template = extract_template(
+            network, plainest_pose(samples.conditions[samples.seen]), outfit.field(), cell=recipe.cell
+        )
+        template.save(outfit.template_file)
+        say(
+            f"template of {outfit.name}: {len(template.vertices):,} points, Euler characteristic "
+            f"{template.euler_characteristic}"
+        )
