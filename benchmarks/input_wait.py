@@ -93,7 +93,7 @@ def measure(case: Case, folder: Path, device: torch.device, options: argparse.Na
     network = DSFFNet(encoder_widths=case.encoder, decoder_widths=case.decoder).to(device)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-6)
     steps = 10 if options.quick else case.steps if device.type == "cpu" else 150
-    order = TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), BATCH, seed=0)
+    order = TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=BATCH, seed=0)
     banks = {cache: bank_of(cache, dataset, device) for cache in CACHES}
     times = {cache: Times([], []) for cache in banks}
     for turn in range(options.rounds):

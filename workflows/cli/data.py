@@ -261,6 +261,7 @@ def export_command(options: argparse.Namespace) -> None:
     examples:
       dsffnet export data/quickstart.zarr --layout npt-obj --out exported
       dsffnet export data/quickstart.zarr --layout glb --identities 0 3 --poses 0 1 2 --out to-look-at
+      dsffnet export data/clothed-small.zarr --layout glb-animated --out to-play
     """
     from datagen.exporters import export_dataset
     from datagen.store import open_dataset

@@ -63,7 +63,7 @@ def _add_extras(made: Parser) -> None:
         "--project", metavar="NAME", help="fit the target's rigid parts to the output: as the weights human see them"
     )
     made.add_argument("--smooth", default="0", metavar="N|0.2s", help="smooth a sequence over N frames or a time (off)")
-    made.add_argument("--fps", type=_rate, default=30.0, metavar="N", help="frames a second of a sequence (30)")
+    made.add_argument("--fps", type=rate, default=30.0, metavar="N", help="frames a second of a sequence (30)")
     made.add_argument("--picture", action="store_true", help="write a PNG of source, target and output beside C")
     made.add_argument("--viewer", action="store_true", help="write a page to turn them in (HTML) beside C")
 
@@ -136,7 +136,8 @@ def _server(asked: str | None) -> Server:
     return server
 
 
-def _rate(word: str) -> float:
+def rate(word: str) -> float:
+    """Frames a second, as they come from a command line."""
     value = float(word)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{word!r} is not a number above 0")

@@ -1,24 +1,24 @@
-"""Made-up people and animals for the page: identities that no training saw, in poses between random ones.
+"""Made-up people and animals for the page: identities that no training saw, bare or in an outfit.
 
 People are Anny's, of the phenotypes that the sliders say; animals are the CC0 ones with other proportions, and are
-offered only where their files already are. Poses come from the distributions of the recipes ``human`` and ``animals``,
-with a seed of the page's own.
+offered only where their files already are.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
 
-from datagen.bodies import BodyModel, load_body
+from datagen.bodies import BodyModel, load_body, part_labels
 from datagen.characters import cc0_animals
 from datagen.mesh.geometry import Mesh, standing_point
-from datagen.poses import Poses, draw_poses
-from datagen.recipe import AnnyBody, AnnyTopology, ClipPoses, NptPoses, PoseRecipe, RiggedBody
+from datagen.recipe import AnnyBody, AnnyTopology, ClothedBody, RiggedBody
+from datagen.recipe.clothed import OUTFITS
+from workflows.demo.poses import ANIMAL, LAST_POSE, Pose, poses_of
 
-PERSON, ANIMAL = "person", "animal"
-LAST_POSE = 200
 SPECIES = cc0_animals.NAMES
+BARE = "none"
+CLOTHES = (BARE, *OUTFITS)
 DETAILS: dict[str, AnnyTopology] = {
     "12,272 vertices": "notoes",
     "615 vertices": "notoes_collapse5pc",
@@ -29,29 +29,32 @@ ANIMALS_MISSING = (
     "Animals need files that are fetched once: `python -c 'from datagen.characters.cc0_animals import animal_files; "
     "animal_files()'`, then start the page again (docs/bodies/rigged.md)."
 )
-_SEED = 20_000  # no recipe of the project draws from it
-_WALK, _STEPS = 3, 12  # poses of a walk, and frames from one to the next
-_DISTRIBUTIONS = {PERSON: NptPoses(), ANIMAL: ClipPoses(path="animals", jitter=0)}
 
 
 @dataclass(frozen=True)
 class Figure:
     """A made-up body.
 
-    ``parameters`` are the body model's; ``pose``: 0 is at rest, 1 to LAST_POSE are random poses, and what lies between
-    two whole numbers lies on the way from the one to the other. ``topology`` is a person's mesh.
+    ``parameters`` are the body model's; ``topology`` and ``outfit`` are a person's.
     """
 
     kind: str
     parameters: tuple[float, ...]
-    pose: float
+    pose: Pose = field(default_factory=Pose)
     topology: AnnyTopology = "notoes"
+    outfit: str = BARE
 
     @property
     def name(self) -> str:
         """What messages call it, and its file."""
         what = SPECIES[int(self.parameters[0])] if self.kind == ANIMAL else self.kind
-        return f"{what}-pose-{self.pose:g}"
+        worn = "" if self.outfit == BARE else f"-{self.outfit}"
+        return f"{what}{worn}-{self.pose.name}"
+
+    @property
+    def is_clothed(self) -> bool:
+        """Whether it wears an outfit."""
+        return self.outfit != BARE
 
 
 def animals_are_there() -> bool:
@@ -61,44 +64,53 @@ def animals_are_there() -> bool:
 
 def parameter_names(kind: str) -> tuple[str, ...]:
     """The parameters that a slider each is for; an animal's first, its species, is none of them."""
-    names = _body(kind, "notoes").parameter_names
+    names = _body(Figure(kind, ())).parameter_names
     return names[1:] if kind == ANIMAL else names
 
 
-def mesh_of(figure: Figure) -> Mesh:
-    """The figure's mesh: metres, Y up, facing +Z, standing on the ground at the origin."""
-    body, parameters = _body(figure.kind, figure.topology), np.array(figure.parameters)
-    vertices = body.vertices(parameters, _pose(figure.kind, figure.pose))[0]
+def mesh_of(figure: Figure, *, draped: bool = False) -> Mesh:
+    """The figure's mesh: metres, Y up, facing +Z, standing on the ground at the origin.
+
+    Garments follow the skin below them, as at rest they do exactly; ``draped``: as cloth, which takes a second or two.
+    """
+    body, parameters = _body(figure, draped=draped), _parameters(figure)
+    vertices = body.vertices(parameters, poses_of(figure.kind, figure.pose))[0]
     return Mesh((vertices - standing_point(vertices)).astype(np.float32), body.faces(parameters))
 
 
 def truth_of(source: Figure, target: Figure) -> Mesh | None:
     """The target's identity in the source's pose; None where a pose of the one says nothing of the other."""
-    return mesh_of(replace(target, pose=source.pose)) if source.kind == target.kind else None
+    if source.kind != target.kind:
+        return None
+    return mesh_of(replace(target, pose=source.pose), draped=target.is_clothed)
+
+
+def garments_of(figure: Figure) -> NDArray[np.integer] | None:
+    """What each vertex [v] belongs to, 0 skin, from 1 on the parts of the outfit; None of a bare body."""
+    return part_labels(_body(figure), _parameters(figure))
 
 
 def walk(figure: Figure) -> list[Figure]:
-    """The figure on its way from its pose through the next random ones."""
-    return [replace(figure, pose=round(figure.pose + step / _STEPS, 4)) for step in range(_WALK * _STEPS + 1)]
+    """The figure in the poses that are played, from its own on."""
+    return [replace(figure, pose=pose) for pose in figure.pose.on_the_way()]
 
 
 def random_figure(kind: str, random: np.random.Generator, topology: AnnyTopology = "notoes") -> Figure:
-    """A figure of any identity in any pose."""
-    drawn = _body(kind, topology).draw_identity(random, int(random.integers(len(SPECIES))))
-    return Figure(kind, tuple(np.round(drawn, 2).tolist()), float(random.integers(1, LAST_POSE + 1)), topology)
+    """A figure of any identity in any random pose."""
+    drawn = _body(Figure(kind, (), topology=topology)).draw_identity(random, int(random.integers(len(SPECIES))))
+    pose = Pose(float(random.integers(1, LAST_POSE + 1)))
+    return Figure(kind, tuple(np.round(drawn, 2).tolist()), pose, topology)
 
 
-def _pose(kind: str, number: float) -> Poses:
-    """One pose: at rest, a random one, or on the way, on which every joint starts and ends gently."""
-    whole = int(number)
-    drawn = draw_poses(PoseRecipe(distribution=_DISTRIBUTIONS[kind], seed=_SEED), range(whole, whole + 2))
-    if whole == 0:
-        drawn.rotations[0] = 0
-    share = number - whole
-    begin, end = (Rotation.from_rotvec(rotations) for rotations in drawn.rotations)
-    moment = begin * (begin.inv() * end) ** (share * share * (3 - 2 * share))
-    return Poses(drawn.joints, drawn.parents, moment.as_rotvec()[None])
+def _parameters(figure: Figure) -> NDArray[np.float64]:
+    worn = (list(OUTFITS).index(figure.outfit), 1.0) if figure.is_clothed else ()  # 1.0: as wide as the outfit says
+    return np.array([*figure.parameters, *worn], np.float64)
 
 
-def _body(kind: str, topology: AnnyTopology) -> BodyModel:
-    return load_body(AnnyBody(topology=topology) if kind == PERSON else RiggedBody(path="animals"))
+def _body(figure: Figure, *, draped: bool = False) -> BodyModel:
+    if figure.kind == ANIMAL:
+        return load_body(RiggedBody(path="animals"))
+    person = AnnyBody(topology=figure.topology)
+    if not figure.is_clothed:
+        return load_body(person)
+    return load_body(ClothedBody(body=person, outfits=tuple(OUTFITS), method="draped" if draped else "skinned"))

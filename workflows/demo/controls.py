@@ -1,29 +1,28 @@
 """The controls by which a person chooses one body: a made-up person or animal by sliders, or a file."""
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import viser
 
-from datagen.common.errors import DsffnetError
 from workflows.demo.bodies import (
-    ANIMAL,
     ANIMALS_MISSING,
+    BARE,
+    CLOTHES,
     DETAILS,
-    LAST_POSE,
-    PERSON,
     SPECIES,
     Figure,
     animals_are_there,
     parameter_names,
     random_figure,
 )  # fmt: skip
+from workflows.demo.file_controls import MeshFileControls
+from workflows.demo.pose_controls import PoseControls
+from workflows.demo.poses import ANIMAL, PERSON, Pose, PoseFile
 from workflows.demo.transfers import Body
-from workflows.demo.uploads import ACCEPTED, BYTE_LIMIT, FRAME_LIMIT
+from workflows.demo.uploads import ACCEPTED
 
-log = logging.getLogger(__name__)
 KINDS = {"made-up person": PERSON, "made-up animal": ANIMAL}
 OWN = "my own mesh"
 _HINTS = {
@@ -34,7 +33,7 @@ _SHOWN_PROPORTIONS = ("torso length", "neck length", "head size", "limb length",
 
 
 class BodyControls:
-    """One tab: what stands as ``source`` or ``target``."""
+    """One tab: what stands as source or as target."""
 
     def __init__(
         self,
@@ -42,31 +41,29 @@ class BodyControls:
         first: Figure,
         keep: Callable[[str, bytes], tuple[Path, ...]],
         *,
+        keep_poses: Callable[[str, bytes], PoseFile] | None,
         changed: Callable[[], None],
         failed: Callable[[str], None],
         takes: str,
     ) -> None:
-        """``keep`` takes an upload, ``changed`` is called after every change, ``takes`` says what may be uploaded."""
-        self._gui, self._keep, self._changed, self._failed = gui, keep, changed, failed
+        """``keep`` takes an upload, ``keep_poses`` one of poses (None of the target, which is offered clothes).
+
+        ``changed`` is called after every change, ``takes`` says what may be uploaded.
+        """
+        self._gui, self._changed = gui, changed
         self._random = np.random.default_rng()
-        self._own: tuple[Path, ...] = ()
         self._is_setting = False
         kinds = [name for name, kind in KINDS.items() if kind == PERSON or animals_are_there()]
         self._kind = gui.add_dropdown("Body", (*kinds, OWN))
         self._detail = gui.add_dropdown("Mesh", tuple(DETAILS), hint="Anny's topologies; fewer vertices are faster")
+        self._outfit = (
+            gui.add_dropdown("Outfit", CLOTHES, hint="people in clothes stand at rest") if not keep_poses else None
+        )
         self._species = gui.add_dropdown("Species", SPECIES) if len(kinds) > 1 else None
         self._sliders = {PERSON: self._phenotypes(first), ANIMAL: self._proportions() if self._species else {}}
-        self._pose = gui.add_slider(
-            "Pose", 0, LAST_POSE, 1, int(first.pose), hint="0: at rest; the others are random, and none was in training"
-        )
+        self._poses = PoseControls(gui, first.pose, keep=keep_poses, changed=changed, failed=failed)
         self._another = gui.add_button("Another at random", icon=viser.Icon.DICE_5, color="gray")
-        self._file = gui.add_folder("File")  # an upload button cannot be hidden by itself
-        with self._file:
-            self._about = gui.add_markdown(
-                f"Choose a file, or drop it there: {takes}; up to {BYTE_LIMIT // 2**20} MB. It stays on the machine "
-                "that runs this page, and goes when you leave."
-            )
-            self._upload = gui.add_upload_button("Choose a file", mime_type=ACCEPTED)
+        self._file = MeshFileControls(gui, takes, accepted=ACCEPTED, keep=keep, changed=changed, failed=failed)
         self._missing = None if self._species else gui.add_markdown(ANIMALS_MISSING)
         self._listen()
         self._arrange()
@@ -75,14 +72,20 @@ class BodyControls:
         """What is chosen; None before a file is."""
         kind = KINDS.get(self._kind.value)
         if kind is None:
-            return self._own or None
+            return self._file.files or None
         values = tuple(float(slider.value) for slider in self._sliders[kind].values())
         if kind == PERSON:
-            return Figure(kind, values, float(self._pose.value), DETAILS[self._detail.value])
+            pose = Pose() if self._is_clothed else self._poses.pose
+            return Figure(kind, values, pose, DETAILS[self._detail.value], self._outfit.value if self._outfit else BARE)
         given = dict(zip(self._sliders[kind], values, strict=True))
         factors = (given.get(name, 1.0) for name in parameter_names(kind))
         assert self._species is not None
-        return Figure(kind, (float(SPECIES.index(self._species.value)), *factors), float(self._pose.value))
+        return Figure(kind, (float(SPECIES.index(self._species.value)), *factors), self._poses.pose)
+
+    @property
+    def geometries(self) -> tuple[str, ...]:
+        """Of a mesh of one's own, those that are taken; none for all."""
+        return () if self._kind.value in KINDS else self._file.geometries
 
     def draw(self) -> None:
         """Another body at random, in another pose."""
@@ -94,7 +97,7 @@ class BodyControls:
         drawn = dict(zip(parameter_names(kind), figure.parameters[-len(parameter_names(kind)) :], strict=True))
         for name, slider in self._sliders[kind].items():
             slider.value = drawn[name]
-        self._pose.value = int(figure.pose)
+        self._poses.pose = figure.pose
         self._is_setting = False
         self._changed()
 
@@ -113,12 +116,13 @@ class BodyControls:
         }
 
     def _listen(self) -> None:
-        sliders = [*self._sliders[PERSON].values(), *self._sliders[ANIMAL].values(), self._pose]
-        for handle in (*sliders, self._detail, *([self._species] if self._species else [])):
+        dropdowns = [each for each in (self._detail, self._species) if each]
+        for handle in (*self._sliders[PERSON].values(), *self._sliders[ANIMAL].values(), *dropdowns):
             handle.on_update(lambda _: self._is_setting or self._changed())
+        if self._outfit:
+            self._outfit.on_update(lambda _: self._choose_kind())
         self._kind.on_update(lambda _: self._choose_kind())
         self._another.on_click(lambda _: self.draw())
-        self._upload.on_upload(lambda _: self._take(self._upload.value))
 
     def _choose_kind(self) -> None:
         self._arrange()
@@ -132,21 +136,14 @@ class BodyControls:
             for slider in sliders.values():
                 slider.visible = kind == each
         self._detail.visible = kind == PERSON
+        if self._outfit:
+            self._outfit.visible = kind == PERSON
         if self._species:
             self._species.visible = kind == ANIMAL
-        self._pose.visible = self._another.visible = kind is not None
-        self._file.visible = kind is None
+        self._poses.arrange(is_shown=kind is not None and not self._is_clothed, is_person=kind == PERSON)
+        self._another.visible = kind is not None
+        self._file.folder.visible = kind is None
 
-    def _take(self, file: viser.UploadedFile) -> None:
-        try:
-            self._own = self._keep(file.name, file.content)
-        except DsffnetError as error:
-            self._failed(str(error))
-            return
-        except Exception as error:
-            log.warning("an upload failed", exc_info=True)
-            self._failed(f"it cannot be read: {error!r}")
-            return
-        frames = f", {len(self._own)} frames of at most {FRAME_LIMIT}" if len(self._own) > 1 else ""
-        self._about.content = f"**{self._own[0].name}**{frames}. Another file takes its place."
-        self._changed()
+    @property
+    def _is_clothed(self) -> bool:
+        return KINDS.get(self._kind.value) == PERSON and self._outfit is not None and self._outfit.value != BARE

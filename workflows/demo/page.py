@@ -1,18 +1,18 @@
-"""The page that one person sees: controls at the side, three bodies, and what can be said of the result."""
+"""The page that one person sees: controls at the side, three bodies, and the result's captions."""
 
 import threading
 from collections.abc import Callable
-from html import escape
 from pathlib import Path
 
 import numpy as np
 import viser
 
 from datagen.common.errors import DsffnetError
-from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
-from training.viz.style import ERROR_COLORS
-from workflows.demo.bodies import PERSON, Figure, random_figure
+from training.viz.style import error_colors
+from workflows.demo.bodies import Figure, garments_of, random_figure
+from workflows.demo.captions import about, dressed_colors, label, legend
 from workflows.demo.controls import BodyControls
+from workflows.demo.poses import PERSON, PoseFile
 from workflows.demo.session import Session
 from workflows.demo.stage import Stage
 from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers, clash_of
@@ -25,7 +25,6 @@ input[type=file] ~ button { display: none; }
 </style>"""
 _AS_FOUND, _WITHOUT = "as found", "none"
 _SMOOTH_FRAMES = 7
-_BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
 
 
 class Page:
@@ -68,7 +67,7 @@ class Page:
             self._status.content = f"**Up and Front.** {clash}"
             return
         moving = self._moving.value or (not isinstance(source, Figure) and len(source) > 1)
-        self.session.ask(Asked(source, target, self._switches(), moving=moving))
+        self.session.ask(Asked(source, target, self._switches(), moving=moving, draped=self._errors.value))
 
     def posing(self) -> None:
         """Say that a transfer has begun."""
@@ -82,7 +81,7 @@ class Page:
         if len(outcome.frames) == 1:
             self._draw(outcome, outcome.frames[0])
             self._stage.arrange()
-        self._status.content = _about(outcome)
+        self._status.content = about(outcome)
 
     def fail(self, message: str) -> None:
         """Say what cannot be done; what is shown stays."""
@@ -102,7 +101,7 @@ class Page:
         with tabs.add_tab("Source", viser.Icon.RUN):
             gui.add_markdown("Gives the **pose**.")
             takes = "OBJ, PLY, GLB, OFF, STL, or a .zip of frames"
-            self._source = self._controls("source", random_figure(PERSON, random), takes)
+            self._source = self._controls("source", random_figure(PERSON, random), takes, poses=self.session.keep_poses)
         with tabs.add_tab("Target", viser.Icon.USER):
             gui.add_markdown("Gives the **body**; its own pose does not matter.")
             takes = "OBJ, PLY, GLB, OFF, STL, or a .zip with its materials"
@@ -110,13 +109,15 @@ class Page:
         with tabs.add_tab("Options", viser.Icon.ADJUSTMENTS):
             self._add_switches()
 
-    def _controls(self, role: str, first: Figure, takes: str) -> BodyControls:
+    def _controls(
+        self, role: str, first: Figure, takes: str, poses: Callable[[str, bytes], PoseFile] | None = None
+    ) -> BodyControls:
         def keep(name: str, content: bytes) -> tuple[Path, ...]:
             return self.session.keep(role, name, content)
 
         return BodyControls(
-            self._client.gui, first, keep, changed=self.ask, failed=lambda error: self.fail(self.session.plain(error)),
-            takes=takes,
+            self._client.gui, first, keep, keep_poses=poses, changed=self.ask,
+            failed=lambda error: self.fail(self.session.plain(error)), takes=takes,
         )  # fmt: skip
 
     def _add_switches(self) -> None:
@@ -139,13 +140,13 @@ class Page:
     def _add_result(self) -> None:
         gui = self._client.gui
         with gui.add_folder("Result"):
-            self._moving = gui.add_checkbox("Walk", False, hint="from one random pose to the next; frames are played")
+            self._moving = gui.add_checkbox("Play", False, hint="a made-up source, through its next poses or its file")
             self._errors = gui.add_checkbox("Error map", False, hint="known where both bodies are made up")
             self._legend = gui.add_html("")
             buttons = [gui.add_button(f"Download {kind}", icon=viser.Icon.DOWNLOAD) for kind in ("GLB", "OBJ")]
             view = gui.add_button("Reset the view", icon=viser.Icon.VIEWFINDER, color="gray")
         self._moving.on_update(lambda _: self.ask())
-        self._errors.on_update(lambda _: self._draw_again())
+        self._errors.on_update(lambda _: self._choose_errors())
         for suffix, button in zip((".glb", ".obj"), buttons, strict=True):
             button.on_click(self._downloading(suffix))
         view.on_click(lambda _: self._stage.reset())
@@ -160,6 +161,8 @@ class Page:
             up=up,
             front=front,
             smooth=str(_SMOOTH_FRAMES) if self._smooth.value else "0",
+            source_geometry=self._source.geometries,
+            target_geometry=self._target.geometries,
         )
 
     def _downloading(self, suffix: str) -> Callable[[object], None]:
@@ -175,6 +178,13 @@ class Page:
 
         return download
 
+    def _choose_errors(self) -> None:
+        outcome = self.session.outcome
+        if self._errors.value and outcome is not None and outcome.waits_for_draping:
+            self.ask()
+        else:
+            self._draw_again()
+
     def _draw_again(self) -> None:
         with self._drawing:
             outcome = self.session.outcome
@@ -184,15 +194,15 @@ class Page:
     def _draw(self, outcome: Outcome, frame: Posed) -> None:
         with self._drawing, self._client.atomic():
             sizes = {role: float(np.ptp(getattr(frame, role).vertices, axis=0).max()) for role in ("source", "target")}
-            self._stage.show("source", frame.source, unit=sizes["source"])
-            self._stage.show("target", frame.target, unit=sizes["target"])
             errors = frame.errors if self._errors.value else None
             worst = float(np.percentile(errors, 99)) if errors is not None else 1.0
-            self._stage.show("output", frame.output, unit=sizes["target"], errors=errors, worst=worst)
-            self._stage.say(
-                "output", "" if frame.pmd is None else f"PMD {frame.pmd / POINT_MESH_DISTANCE_SCALE:.2f}e-4"
-            )
-            self._legend.content = _legend(frame, worst, shown=errors is not None)
+            garments = garments_of(outcome.asked.target) if isinstance(outcome.asked.target, Figure) else None
+            self._stage.show("source", frame.source, unit=sizes["source"])
+            self._stage.show("target", frame.target, unit=sizes["target"], colors=dressed_colors("target", garments))
+            colors = dressed_colors("output", garments) if errors is None else error_colors(errors, worst)
+            self._stage.show("output", frame.output, unit=sizes["target"], colors=colors)
+            self._stage.say("output", label(outcome, frame))
+            self._legend.content = legend(outcome, frame, worst, shown=self._errors.value)
 
     def _play(self) -> None:
         """Show the frames of a sequence, one after the other; of a walk also backwards."""
@@ -205,32 +215,8 @@ class Page:
 
 
 def _place(frame: int, outcome: Outcome) -> int:
-    """Which frame of a sequence comes as the so manieth."""
-    count = len(outcome.frames)
-    if isinstance(outcome.asked.source, Figure):
+    """Which frame of a sequence comes as the so manieth; the way between random poses is played back and forth."""
+    count, source = len(outcome.frames), outcome.asked.source
+    if isinstance(source, Figure) and not source.pose.file:
         return abs((frame + count - 1) % (2 * count - 2) - (count - 1))
     return frame % count
-
-
-def _about(outcome: Outcome) -> str:
-    vertices = f"{len(outcome.file.mesh.vertices):,} vertices"
-    frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
-    lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
-    return "\n\n".join([*lines, *(f"⚠ {warning}" for warning in outcome.warnings)])
-
-
-def _legend(frame: Posed, worst: float, *, shown: bool) -> str:
-    """The bar of colours, and what PMD is."""
-    if frame.pmd is None:
-        words = "The truth is known, and an error map, where source and target are made-up bodies of one kind."
-        return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>' if shown else ""
-    if not shown:
-        return ""
-    ticks = "".join(f"<span>{100 * worst * share:.1f}</span>" for share in (0, 0.5, 1))
-    return (
-        '<div style="margin:4px 14px 10px;font-size:12px;color:#5d6676">'
-        f'<div style="height:9px;border-radius:3px;background:linear-gradient(90deg,{_BAR})"></div>'
-        f'<div style="display:flex;justify-content:space-between">{ticks}</div>'
-        "<div>distance of each vertex to the truth, in cm (the last: 99th percentile and above); PMD: mean square of "
-        "it in the truth's box, boxes centred alike</div></div>"
-    )

@@ -1,5 +1,6 @@
 """What one person at the page has: a folder, and a transfer that follows what they choose."""
 
+import contextlib
 import io
 import logging
 import re
@@ -11,17 +12,19 @@ from collections import defaultdict
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from datagen.common.errors import DsffnetError, MeshError
+from datagen.common.errors import DsffnetError, MeshError, NotOneBodyError
 from datagen.common.printable import printable
 from datagen.common.resources import ran_out_of_memory
 from datagen.mesh.files import write_posed
+from datagen.mesh.geometries import CHOOSE
 from datagen.mesh.sequences import write_animation
-from workflows.demo.newest import Newest
+from workflows.demo.poses import PoseFile, read_poses
 from workflows.demo.transfers import Asked, Outcome, Transfers, read
-from workflows.demo.uploads import FRAME_LIMIT, keep
+from workflows.demo.uploads import FRAME_LIMIT, keep, keep_poses
 
+Work = TypeVar("Work")
 log = logging.getLogger(__name__)
 
 
@@ -77,7 +80,8 @@ class Session:
         folder = self._folder / f"{role}-{next(self._uploads)}"
         try:
             files = keep(name, content, folder, most=1 if role == "target" else FRAME_LIMIT)
-            read(files[0])
+            with contextlib.suppress(NotOneBodyError):  # until a person has chosen among its geometries
+                read(files[0])
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -85,6 +89,19 @@ class Session:
         for former in self._kept[role][:-2]:  # the last one may be read at this moment
             shutil.rmtree(former, ignore_errors=True)
         return tuple(files)
+
+    def keep_poses(self, name: str, content: bytes) -> PoseFile:
+        """The poses of an upload, of which no file stays.
+
+        Raises
+        ------
+        DsffnetError
+            It is refused.
+        """
+        with self._here:
+            self._require_open()
+            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
+                return read_poses(keep_poses(name, content, Path(folder) / "poses"))
 
     def result(self, suffix: str) -> Result:
         """A file of the result: an animated GLB of several frames; a .zip where materials and textures go with it.
@@ -132,8 +149,9 @@ class Session:
 
     def plain(self, error: object) -> str:
         """A message in which files are called by their names, not by where they lie."""
-        text = re.sub(rf"{re.escape(str(self._folder))}/([\w-]+/)?", "", str(error))
-        return printable(text.replace("look at --picture", "look at it"))
+        text = re.sub(rf"{re.escape(str(self._folder))}/([\w-]+/)*", "", str(error))
+        plain = text.replace("look at --picture", "look at it").replace(f"Choose with {CHOOSE}", "Choose among them")
+        return printable(plain)
 
 
 def _written(outcome: Outcome, out: Path) -> list[str]:
@@ -155,3 +173,44 @@ def _file_or_zip(out: Path) -> tuple[str, bytes]:
         for path in files:
             archive.write(path, path.relative_to(out.parent))
     return f"{out.stem}.zip", packed.getvalue()
+
+
+class Newest(Generic[Work]):
+    """A thread that does the newest of what it is asked; a slider that moves asks far more often than it can do.
+
+    ``work`` is given what was asked and a function that says whether something newer waits, so that long work can end.
+    """
+
+    def __init__(self, work: Callable[[Work, Callable[[], bool]], None]) -> None:
+        self._work = work
+        self._waiting: list[Work] = []
+        self._changed = threading.Condition()
+        self._is_open = True
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def ask(self, asked: Work) -> None:
+        """Do this next, and nothing of what waited."""
+        with self._changed:
+            self._waiting[:] = [asked]
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Wait for what is being done; nothing more is done."""
+        with self._changed:
+            self._is_open = False
+            self._changed.notify()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _is_stale(self) -> bool:
+        return bool(self._waiting) or not self._is_open
+
+    def _run(self) -> None:
+        while (asked := self._next()) is not None:
+            self._work(asked, self._is_stale)
+
+    def _next(self) -> Work | None:
+        with self._changed:
+            self._changed.wait_for(self._is_stale)
+            return self._waiting.pop() if self._is_open else None

@@ -12,19 +12,16 @@ from datagen.common.arrays import Floats
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Material, Surface
 from datagen.mesh.geometry import Mesh, standing_point
-from training.viz.style import ROLE_COLORS, error_colors
+from training.viz.style import ROLE_COLORS
 
 ROLES = {"source": "source: the pose", "target": "target: the body", "output": "result"}
-_TALL, _GAP, _DISC = (
-    1.7,
-    0.08,
-    0.6,
-)  # of the longest edge of a body's box, between two, of a disc; the scene has no unit
+_TALL, _GAP, _DISC = 1.7, 0.08, 0.6
+"""Of the longest edge of a body's box, between two, of a disc; the scene has no unit."""
 _FIELD = math.radians(32)
 _ROOM = 1.3  # for the labels above and what is below
 _TURNED, _RAISED = math.radians(-25), math.radians(8)
 _MOST = 0.98  # of the vertices, for which room is made: a hand may reach over
-_LIFTED = 0.27  # of a high, narrow window, whose lower half the controls cover
+_NARROW, _UNCOVERED = 576, 0.4  # pixels of a window over which the controls lie; what they leave of its height
 _CHANGED = 0.12  # of the scene's size: a smaller change does not move the camera
 _MOVED, _SETTLED = 1e-3, 0.5  # radians that count as a turn; seconds
 _LYING = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # a quarter turn about X, of what has Z for its axis
@@ -56,17 +53,17 @@ class Stage:
         self._azimuth = _TURNED
         client.camera.on_update(self._follow)
 
-    def show(self, role: str, mesh: Mesh, *, unit: float, errors: Floats | None = None, worst: float = 1.0) -> None:
+    def show(self, role: str, mesh: Mesh, *, unit: float, colors: Floats | None = None) -> None:
         """Show a body that stands with Y up; ``unit``: its length that is drawn as long as a body is.
 
-        With ``errors`` [v] it is coloured by them, up to ``worst``.
+        ``colors`` [v, 3] in [0, 1], or its role's.
         """
         its = self._shown[role]
         vertices = (mesh.vertices - standing_point(mesh.vertices)) * (_TALL / unit)
         its.reach = float(np.quantile(np.hypot(vertices[:, 0], vertices[:, 2]), _MOST))
         its.height = float(vertices[:, 1].max())
-        if errors is not None:
-            self._paint(role, Mesh(vertices, mesh.faces), error_colors(errors, worst))
+        if colors is not None:
+            self._paint(role, Mesh(vertices, mesh.faces), colors)
         else:
             self._draw(role, Mesh(vertices, mesh.faces))
         its.label.position = (0.0, its.height + 0.06, 0.0)
@@ -98,7 +95,7 @@ class Stage:
         label = scene.add_label(f"/{role}/label", ROLES[role], anchor="bottom-center", font_screen_scale=1.1)
         disc = scene.add_cylinder(
             f"/{role}/disc", radius=1.0, height=0.012, color=(232, 235, 239), position=(0.0, -0.008, 0.0),
-            wxyz=_LYING,            cast_shadow=False,
+            wxyz=_LYING, cast_shadow=False,
         )  # fmt: skip
         return _Shown(node, label, disc)
 
@@ -135,10 +132,13 @@ class Stage:
 
     def _look(self, width: float, height: float) -> None:
         camera = self._client.camera
-        near = max(width / max(camera.aspect, 0.2), height * _ROOM) / (2 * math.tan(_FIELD / 2))
+        is_narrow = camera.aspect < 1 or camera.image_width < _NARROW
+        free = _UNCOVERED if is_narrow else 1.0
+        seen = max(width / max(camera.aspect, 0.2), height * _ROOM / free)
+        near = seen / (2 * math.tan(_FIELD / 2))
         distance = near + max(its.reach for its in self._shown.values())
         flat = distance * math.cos(_RAISED)
-        middle = height * 0.53 - (_LIFTED * width / camera.aspect if camera.aspect < 1 else 0.0)
+        middle = height * 0.53 - seen * (1 - free) / 2
         with self._client.atomic():
             camera.fov = _FIELD
             camera.up_direction = (0.0, 1.0, 0.0)

@@ -5,7 +5,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,8 @@ from training.inference.orientation import UPRIGHT, Axes
 from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import recentred_point_mesh_distance
-from workflows.demo.bodies import PERSON, Figure, mesh_of, random_figure, truth_of, walk
+from workflows.demo.bodies import Figure, mesh_of, random_figure, truth_of, walk
+from workflows.demo.poses import PERSON
 from workflows.demo.uploads import VERTEX_LIMIT
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
@@ -46,16 +47,26 @@ class Switches:
     front: str | None = None
     smooth: str = "0"
     fps: float = 15.0
+    source_geometry: tuple[str, ...] = ()
+    target_geometry: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What a person wants posed; ``moving``: frames, not one pose."""
+    """What a person wants posed; ``moving``: frames, not one pose; ``draped``: the truth also where it is cloth."""
 
     source: Body
     target: Body
     switches: Switches = field(default_factory=Switches)
     moving: bool = False
+    draped: bool = False
+
+    @property
+    def needs_draping(self) -> bool:
+        """Whether the truth is known by draping alone: a person in clothes, posed like a made-up one."""
+        target = self.target
+        is_clothed = isinstance(target, Figure) and target.is_clothed
+        return is_clothed and isinstance(self.source, Figure) and self.source.kind == PERSON
 
 
 @dataclass(frozen=True)
@@ -87,6 +98,11 @@ class Outcome:
     weights: str
     warnings: list[str]
     seconds: float = 0.0
+
+    @property
+    def waits_for_draping(self) -> bool:
+        """Whether it has no errors yet, which draping would tell."""
+        return self.asked.needs_draping and not self.asked.moving and self.frames[0].errors is None
 
 
 class _Remembering(PoseTransfer):
@@ -138,15 +154,14 @@ class Transfers:
         target = _files_of(asked.target, folder / "target", moving=False)[0]
         job = _job(asked, sources, target, folder, named=self.weights is not None)
         with _ONE_AT_A_TIME:
-            began = time.perf_counter()
             for outcome in self._outcomes(asked, job):
-                outcome.seconds = time.perf_counter() - began
                 show(outcome)
                 if stale():
                     break
 
     def _outcomes(self, asked: Asked, job: TransferJob) -> Iterator[Outcome]:
-        first, target, warnings = read(job.sources[0]), read(job.target), list[str]()
+        began, warnings = time.perf_counter(), list[str]()
+        first, target = read(job.sources[0], job.source_geometry), read(job.target, job.target_geometry)
         work = TransferWork.of(
             job, self.weights, first=first.mesh, target=target, force=asked.switches.force, load=self._load,
             warn=warnings.append,
@@ -156,13 +171,18 @@ class Transfers:
         require_room(outcome.count, first.mesh, target.mesh)
         stood = _turned(work.axes[1], target.mesh)
         for number, posed in enumerate(work.posed()):
-            mesh = read(job.sources[number]).mesh if number else first.mesh
+            mesh = read(job.sources[number], job.source_geometry).mesh if number else first.mesh
             if np.array_equal(mesh.faces, first.mesh.faces):
                 mesh = Mesh(mesh.vertices, first.mesh.faces)
             frame = Posed(_turned(work.axes[0], mesh), stood, _turned(work.axes[1], posed), posed)
-            if figures and isinstance(asked.target, Figure):
+            if figures and isinstance(asked.target, Figure) and not asked.needs_draping:
                 frame = _measured(frame, truth_of(figures[number], asked.target))
             outcome.frames.append(_slim(frame) if job.is_sequence else frame)
+            outcome.seconds = time.perf_counter() - began
+            yield outcome
+        if asked.draped and asked.needs_draping and not asked.moving:  # what takes longer comes after the result
+            assert isinstance(asked.target, Figure)
+            outcome.frames[0] = _measured(outcome.frames[0], truth_of(figures[0], asked.target))
             yield outcome
 
 
@@ -187,9 +207,9 @@ def _files_of(body: Body, folder: Path, *, moving: bool) -> list[Path]:
     return places
 
 
-def read(path: Path) -> MeshFile:
+def read(path: Path, geometries: Sequence[str] = ()) -> MeshFile:
     """As ``dsffnet transfer`` reads it; MeshError also where it has more vertices than the page takes."""
-    file = read_mesh_file(path)
+    file = read_mesh_file(path, geometries=geometries)
     if len(file.mesh.vertices) > VERTEX_LIMIT:
         raise MeshError(
             f"{path} has {len(file.mesh.vertices):,} vertices, the page takes {VERTEX_LIMIT:,}: decimate it, or use "
@@ -202,7 +222,7 @@ def _job(asked: Asked, sources: list[Path], target: Path, folder: Path, *, named
     """The job of the command line that would do the same; ``named``: weights are."""
     options = argparse.Namespace(
         paths=[str(sources[0]), str(target)], source=None, target=None, out=folder / "posed.glb",
-        picture=False, viewer=False, source_geometry=(), target_geometry=(), model=named, **vars(asked.switches),
+        picture=False, viewer=False, model=named, **vars(asked.switches),
     )  # fmt: skip
     made_up = [isinstance(body, Figure) for body in (asked.source, asked.target)]
     if any(made_up) and (all(made_up) or options.up or options.front):  # what is chosen is said of one's own mesh

@@ -24,6 +24,7 @@ FRAME_LIMIT = 240
 VERTEX_LIMIT = 100_000
 """Of a mesh on the page; ``dsffnet transfer`` takes more."""
 ACCEPTED = ",".join((*FORMATS, ".zip"))
+POSES = ".npz"
 _BESIDE = (".mtl", ".png", ".jpg", ".jpeg")  # of an OBJ or PLY
 _LONGEST_NAME, _DEEPEST = 60, 8
 _UNREADABLE = (
@@ -66,6 +67,23 @@ def keep(name: str, content: bytes, folder: Path, *, most: int = FRAME_LIMIT) ->
         (folder / harmless).parent.mkdir(parents=True, exist_ok=True)
         (folder / harmless).write_bytes(its)
     return frames_of(folder / beside.pop())
+
+
+def keep_poses(name: str, content: bytes, folder: Path) -> Path:
+    """Write an upload of poses into a folder that is not there yet.
+
+    Raises
+    ------
+    MeshError
+        It is too large, or no .npz.
+    """
+    require_size(name, len(content))
+    if _suffix(name) != POSES:
+        raise MeshError(f"{printable(name)} is no {POSES} of poses (docs/demo.md)")
+    folder.mkdir(parents=True)
+    path = folder / _harmless(name).name
+    path.write_bytes(content)
+    return path
 
 
 def _unpacked(name: str, content: bytes, most: int) -> dict[Path, bytes]:

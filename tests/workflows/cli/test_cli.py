@@ -38,7 +38,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 NAMES = (
     "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
     "sync", "import-weights", "recipe", "sweep", "compare", "ablation", "robustness", "generalisation", "transfer",
-    "submit", "ui",
+    "skin", "submit", "ui",
 )  # fmt: skip
 
 

@@ -6,23 +6,25 @@ import threading
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from datagen.bodies import load_body
 from datagen.common.errors import MeshError
-from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.files import load_mesh, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.poses import draw_poses
 from datagen.recipe import LegBody, PoseRecipe, RangePoses
 from training.inference.orientation import Axes
 from workflows.cli import main as cli
-from workflows.demo.bodies import PERSON, Figure
-from workflows.demo.newest import Newest
-from workflows.demo.session import Session
+from workflows.demo.bodies import Figure
+from workflows.demo.poses import PERSON, Pose
+from workflows.demo.session import Newest, Session
 from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of, require_room
 from workflows.pretrained import own_weights
 
@@ -221,7 +223,7 @@ def test_an_unexpected_failure_is_said_and_ends_nothing(tmp_path: Path, legs: li
 def test_up_and_front_are_said_of_ones_own_mesh_alone(
     place: str, legs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transfers: Transfers
 ) -> None:
-    own, made_up = Mesh(load_mesh(legs[0]).vertices, load_mesh(legs[0]).faces), Figure(PERSON, (0.5,) * 6, 1.0)
+    own, made_up = Mesh(load_mesh(legs[0]).vertices, load_mesh(legs[0]).faces), Figure(PERSON, (0.5,) * 6, Pose(1.0))
     monkeypatch.setattr("workflows.demo.transfers.mesh_of", lambda _: own)  # a person takes seconds to read
     lying = tmp_path / "lying.obj"
     save_mesh(Mesh(Axes("Z", "-Y").restored(own.vertices), own.faces), lying)
@@ -234,7 +236,7 @@ def test_up_and_front_are_said_of_ones_own_mesh_alone(
 
 
 def test_up_alone_waits_for_front(legs: list[Path]) -> None:
-    made_up, own = Figure(PERSON, (0.5,) * 6, 1.0), (legs[0],)
+    made_up, own = Figure(PERSON, (0.5,) * 6, Pose(1.0)), (legs[0],)
     assert "cannot have Z up and face Z" in (clash_of(made_up, own, Switches(up="Z")) or "")
     assert clash_of(made_up, own, Switches(up="Z", front="-Y")) is None
     assert clash_of(made_up, made_up, Switches(up="Z")) is None
@@ -290,6 +292,70 @@ def test_frames_share_what_does_not_move(session: Session, view: Seen, legs: lis
     for frame in others:
         assert frame.target is first.target and frame.source.faces is first.source.faces
         assert {mesh.vertices.dtype for mesh in (frame.source, frame.output, frame.posed)} == {np.dtype(np.float32)}
+
+
+def test_geometries_apart_are_kept_and_posed_as_chosen(session: Session, view: Seen, legs: list[Path]) -> None:
+    leg = load_mesh(legs[0])
+    far = "".join(f"v {x} {y} {z}\n" for x, y, z in leg.vertices + 9).encode()
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in leg.faces + 1 + len(leg.vertices)).encode()
+    two = b"o leg\n" + legs[0].read_bytes() + b"o other\n" + far + faces
+    target = session.keep("target", "two.obj", two)
+    session.ask(Asked((legs[1],), target, replace(STANDING, target_geometry=("leg",))))
+    view.wait()
+    assert not view.failures
+    name, content, left_out = session.result(".obj")
+    assert name == "two-posed.obj" and content.count(b"\nv ") + content.startswith(b"v ") == len(leg.vertices)
+    assert left_out == ["other objects and groups: other"]
+
+
+def test_a_scene_waits_for_a_choice_and_says_where(session: Session, tmp_path: Path) -> None:
+    scene = trimesh.Scene([trimesh.creation.box().apply_translation([9 * place, 0, 0]) for place in range(2)])
+    kept = session.keep("target", "two.glb", scene.export(file_type="glb"))
+    with pytest.raises(MeshError) as refused:
+        read_mesh_file(kept[0])
+    assert session.plain(refused.value).endswith("Choose among them") and "two.glb holds 2" in session.plain(
+        refused.value
+    )
+
+
+def test_poses_are_read_and_no_file_of_them_stays(session: Session, tmp_path: Path) -> None:
+    written = io.BytesIO()
+    np.savez(written, poses=np.zeros((4, 66)))
+    assert session.keep_poses("walk.npz", written.getvalue()).count == 4
+    for name, content in (("walk.npz", b"none"), ("walk.obj", written.getvalue())):
+        with pytest.raises(MeshError, match=r"walk\.") as refused:
+            session.keep_poses(name, content)
+        assert str(tmp_path) not in session.plain(refused.value)
+    assert not list((tmp_path / "session").iterdir())
+
+
+def test_the_truth_of_clothes_comes_after_the_result_where_it_is_asked(
+    legs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transfers: Transfers
+) -> None:
+    meshes, draped = [load_mesh(path) for path in legs], list[Pose]()
+
+    def mesh_of(figure: Figure, *, draped: bool = False) -> Mesh:
+        return meshes[0]
+
+    def truth_of(source: Figure, target: Figure) -> Mesh:
+        draped.append(source.pose)
+        return meshes[1]
+
+    monkeypatch.setattr("workflows.demo.transfers.mesh_of", mesh_of)
+    monkeypatch.setattr("workflows.demo.transfers.truth_of", truth_of)
+    source, target = Figure(PERSON, (0.5,) * 6, Pose(1.0)), Figure(PERSON, (0.5,) * 6, outfit="coat")
+    shown = list[tuple[float | None, bool]]()
+
+    def show(outcome: Outcome) -> None:
+        shown.append((outcome.frames[0].pmd, outcome.waits_for_draping))
+
+    asked = Asked(source, target, Switches(force=True))
+    transfers.run(asked, tmp_path / "work", lambda: False, show)
+    assert shown == [(None, True)] and not draped
+    transfers.run(replace(asked, draped=True), tmp_path / "work", lambda: False, show)
+    assert shown[1] == (None, True) and shown[2][0] and not shown[2][1] and draped == [Pose(1.0)]
+    transfers.run(replace(asked, draped=True), tmp_path / "work", lambda: True, show)  # a slider has moved on
+    assert len(shown) == 4 and len(draped) == 1
 
 
 def test_a_sequence_of_too_many_vertices_is_refused(legs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:

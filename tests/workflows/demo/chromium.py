@@ -19,6 +19,7 @@ _FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run", "--disable-background-networking",
 )  # fmt: skip
+_LONG = 240  # seconds, on a machine that has other work
 _FILE_INPUT = "[...document.querySelectorAll('input[type=file]')].find(e => e.getClientRects().length)"
 
 
@@ -60,17 +61,17 @@ class Browser:
         """All that can be read on the page."""
         return str(self.run("document.body ? document.body.innerText : ''"))
 
-    def wait(self, until: Callable[[], Any], *, seconds: float = 60) -> Any:
+    def wait(self, until: Callable[[], Any]) -> Any:
         """Wait until something is so, and return it."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + _LONG
         while not (found := until()):
-            assert time.monotonic() < end, f"{seconds} s passed; the page says: {self.text()}"
+            assert time.monotonic() < end, f"{_LONG} s passed; the page says: {self.text()}"
             time.sleep(0.1)
         return found
 
-    def wait_for_text(self, words: str, *, seconds: float = 60) -> None:
+    def wait_for_text(self, words: str) -> None:
         """Wait until the page says so."""
-        self.wait(lambda: words in self.text(), seconds=seconds)
+        self.wait(lambda: words in self.text())
 
     def click(self, words: str) -> None:
         """Click the innermost visible element of exactly these words."""
@@ -85,18 +86,31 @@ class Browser:
 
     def choose(self, label: str, option: str) -> None:
         """Choose an option of the visible dropdown of that label."""
-        place = self.run(
-            f"""(() => {{ let e = [...document.querySelectorAll('label')]
-            .filter(e => e.innerText.trim() === {json.dumps(label)} && e.getClientRects().length).pop();
-            while (!e.querySelector('input')) e = e.parentElement;
-            const r = e.querySelector('input').getBoundingClientRect();
-            return [r.x + r.width / 2, r.y + r.height / 2]; }})()"""
-        )
-        self.click_at(*place)
-        self.wait(
-            lambda: self.run(f"""[...document.querySelectorAll('[role=option]')]
-            .some(e => e.innerText.trim() === {json.dumps(option)} && e.getClientRects().length)""")
-        )
+
+        def is_offered() -> bool:
+            return bool(
+                self.run(f"""[...document.querySelectorAll('[role=option]')]
+                .some(e => e.innerText.trim() === {json.dumps(option)} && e.getClientRects().length)""")
+            )
+
+        def opened() -> bool:
+            """Whether it is open; a click that missed, as the page moved below it, is made again."""
+            place = self.run(
+                f"""(() => {{ let e = [...document.querySelectorAll('label')]
+                .filter(e => e.innerText.trim() === {json.dumps(label)} && e.getClientRects().length).pop();
+                while (e && !e.querySelector('input')) e = e.parentElement;
+                if (!e) return null; e = e.querySelector('input'); e.scrollIntoView({{block: 'center'}});
+                const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"""
+            )
+            if not place:
+                return False
+            self.click_at(*place)
+            end = time.monotonic() + 20
+            while not is_offered() and time.monotonic() < end:
+                time.sleep(0.1)
+            return is_offered()
+
+        self.wait(opened)
         self.click(option)
 
     @property
@@ -145,7 +159,7 @@ def chromium(folder: Path) -> Iterator[Browser]:
 def _tab(profile: Path) -> str:
     """The address of the first tab's DevTools."""
     note = profile / "DevToolsActivePort"
-    for _ in range(600):
+    for _ in range(10 * _LONG):
         if note.exists() and (lines := note.read_text().split()):
             with urllib.request.urlopen(f"http://127.0.0.1:{lines[0]}/json") as answer:
                 tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]

@@ -1,0 +1,58 @@
+"""What is said of a result: numbers, the bar of the error map, and the colours of clothes."""
+
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.common.arrays import Floats
+from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
+from training.viz.style import ERROR_COLORS, ROLE_COLORS
+from workflows.demo.transfers import Outcome, Posed
+
+_DARKER = 0.8
+_UNKNOWN = "The truth is known, and an error map, where source and target are made-up bodies of one kind."
+_DRAPED = (
+    "The truth of a person in clothes is the outfit draped over them in the source's pose. It takes a second or "
+    "two, and is not made of what is played."
+)
+_BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
+
+
+def dressed_colors(role: str, garments: NDArray[np.integer] | None) -> Floats | None:
+    """Colours [v, 3] of a person in clothes: skin pale, each garment darker than the one below; None of a bare body."""
+    if garments is None:
+        return None
+    own = np.array(ROLE_COLORS[role])
+    return np.stack([(1 + 2 * own) / 3, *(own * _DARKER**layer for layer in range(garments.max()))])[garments]
+
+
+def label(outcome: Outcome, frame: Posed) -> str:
+    """What stands behind the result's label."""
+    if frame.pmd is not None:
+        return f"PMD {frame.pmd / POINT_MESH_DISTANCE_SCALE:.2f}e-4"
+    return "draping the truth …" if outcome.asked.draped and outcome.waits_for_draping else ""
+
+
+def about(outcome: Outcome) -> str:
+    vertices = f"{len(outcome.file.mesh.vertices):,} vertices"
+    frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
+    lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
+    return "\n\n".join([*lines, *(f"⚠ {warning}" for warning in outcome.warnings)])
+
+
+def legend(outcome: Outcome, frame: Posed, worst: float, *, shown: bool) -> str:
+    """The bar of colours, and what PMD is."""
+    if not shown:
+        return ""
+    if frame.pmd is None:
+        words = _DRAPED if outcome.asked.needs_draping else _UNKNOWN
+        return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>'
+    ticks = "".join(f"<span>{100 * worst * share:.1f}</span>" for share in (0, 0.5, 1))
+    return (
+        '<div style="margin:4px 14px 10px;font-size:12px;color:#5d6676">'
+        f'<div style="height:9px;border-radius:3px;background:linear-gradient(90deg,{_BAR})"></div>'
+        f'<div style="display:flex;justify-content:space-between">{ticks}</div>'
+        "<div>distance of each vertex to the truth, in cm (the last: 99th percentile and above); PMD: mean square of "
+        "it in the truth's box, boxes centred alike</div></div>"
+    )
