@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -22,6 +23,8 @@ _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes thr
 _START_SECONDS = (30.0, 150.0)  # Ray's own patience with its node, and ours after that
 _SERVERS = ("gcs_server", "raylet")
 _LOOK_SECONDS, _LEAVE_SECONDS = 0.5, 20.0
+_RESUME = "What was complete is kept: run the same command again to resume"
+_ENDED = f"this process has been ended in the middle (killed, or by Ray's client library). {_RESUME}"
 WITHOUT_RAY = "--local, where the command has it (dsffnet train: --set training.launcher=inline training.ranks=1)"
 
 
@@ -158,7 +161,7 @@ def own_ray() -> Iterator[None]:
     watch = _Watch()
     try:
         watch.find()
-        with _interrupted_by(watch):
+        with watch.words, _interrupted_by(watch):
             try:
                 yield
             finally:
@@ -191,10 +194,32 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+class _LastWords:
+    """A process beside that prints an error, should this one be ended before it leaves the block: Ray's client library
+    ends its process by a check of its own when a server dies at the wrong moment, the kernel where memory is short.
+    """
+
+    _SCRIPT = 'while read -r line; do last=$line; done; [ -z "$last" ] || echo "$last" >&2'
+
+    def __enter__(self) -> None:
+        self._beside = subprocess.Popen(["sh", "-c", self._SCRIPT], stdin=subprocess.PIPE, text=True)
+        self.be(f"error: {_ENDED}")
+
+    def be(self, line: str) -> None:
+        assert self._beside.stdin is not None
+        with suppress(BrokenPipeError):  # Ctrl-C, which goes to all, has ended it
+            print(line, file=self._beside.stdin, flush=True)
+
+    def __exit__(self, *_: object) -> None:
+        self.be("")
+        self._beside.communicate()
+
+
 class _Watch:
     """Looks after the servers of the Ray that this process has started."""
 
     def __init__(self) -> None:
+        self.words = _LastWords()
         self._kin: list[psutil.Process] = []
         self._servers: dict[str, psutil.Process] = {}
         self.lost = ""
@@ -210,10 +235,7 @@ class _Watch:
 
     @property
     def message(self) -> str:
-        return (
-            f"Ray's {self.lost} has died (killed, or out of memory). What was complete is kept: run the same command "
-            "again to resume"
-        )
+        return f"Ray's {self.lost} has died (killed, or out of memory). {_RESUME}"
 
     def run(self, stop: threading.Event) -> None:
         while not stop.wait(_LOOK_SECONDS):
@@ -230,12 +252,12 @@ class _Watch:
 
         What is left of Ray lives until then: its client library ends the process at once when the raylet goes.
         """
+        self.words.be(f"error: {self.message}")
         main = threading.main_thread().ident
         assert main is not None
         self._kin += _family()  # of now: children of a parent that dies are nobody's
         signal.pthread_kill(main, signal.SIGUSR1)
         if not stop.wait(_LEAVE_SECONDS):
-            print(f"error: {self.message}", file=sys.stderr, flush=True)
             self.end_kin()
             os._exit(ClusterError.exit_status)
 

@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,6 +15,7 @@ from datagen.common.errors import ClusterError
 from datagen.generate import append, generate, inline
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
+from tests.support.commands import ROOT
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
 from workflows.cli.main import main
@@ -197,6 +199,27 @@ def test_a_process_that_ends_while_it_is_looked_at_and_handlers_that_are_not_pyt
     finally:
         signal.signal(signal.SIGTERM, before[0])
         signal.signal(signal.SIGUSR1, before[1])
+
+
+@pytest.mark.parametrize(
+    ("inside", "status", "said"),
+    [
+        ("pass", 0, ""),
+        ("os._exit(1)", 1, "error: this process has been ended in the middle"),
+        ("os.kill(os.getpid(), 9)", -9, "error: this process has been ended in the middle"),
+    ],
+)
+def test_a_process_that_is_ended_within_its_ray_has_last_words(inside: str, status: int, said: str) -> None:
+    """Ray's client library aborts its process when a reply comes after the server that should take note of it died."""
+    script = (
+        "import os, ray; ray.init = lambda **_: None\n"
+        "from workflows.pipeline.own_ray import own_ray\n"
+        f"with own_ray():\n    {inside}"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == status
+    assert ended.stderr.startswith(said) and len(ended.stderr.splitlines()) == bool(said)
+    assert said == "" or ended.stderr.endswith("run the same command again to resume\n")
 
 
 def _raise(error: type[BaseException]) -> None:
