@@ -1,7 +1,7 @@
 """Two ranks of one thread against one process of two: ``python -m benchmarks.training [--rounds 3] [--quick]``.
 
 DSFFNet at the quickstart's widths, a batch of 8 over both ranks, on legs of 615 and 1,230 vertices (the quickstart's
-bodies, and the next topology of Anny). Both ways are whole trainings by ``python -m training``, in turns, on the
+bodies, and the next topology of Anny). Both ways are whole trainings by ``python -m training.engine``, in turns, on the
 same two cores; a training's rate is the median of ``meshes_per_second`` in its journal, without the first line
 (warming up) and the last (which holds the closing evaluation). Two ranks pay for exchanging gradients over gloo, and
 gain where an operation does not use two threads well. On a busy machine look at the ratios, not at the rates.
@@ -95,7 +95,7 @@ def rate(recipe: TrainingRecipe, data: Path, run: Path, *, ranks: int, threads: 
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1]
     shared = {"WORLD_SIZE": ranks, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": threads}
-    command = [sys.executable, "-m", "training", str(path), str(data), str(run)]
+    command = [sys.executable, "-m", "training.engine", str(path), str(data), str(run)]
     processes = []
     for rank in range(ranks):
         own = {name: str(value) for name, value in {**shared, "RANK": rank, "LOCAL_RANK": rank}.items()}

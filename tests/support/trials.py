@@ -5,8 +5,8 @@ from typing import Any
 
 import torch
 
-from workflows.sweep.plan import Trial
-from workflows.sweep.ray_trials import Outcome, Place, train_trial
+from workflows.studies.sweep.plan import Trial
+from workflows.studies.sweep.ray_trials import Outcome, Place, train_trial
 
 
 def here(

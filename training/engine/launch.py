@@ -1,6 +1,6 @@
 """The same ``train`` under different launchers: in this process, or as ranks of Ray Train (torchrun needs nothing).
 
-Under torchrun: ``torchrun --nproc-per-node 2 -m training RECIPE.yaml DATA.zarr RUN [key=value ...]`` reads RANK
+Under torchrun: ``torchrun --nproc-per-node 2 -m training.engine RECIPE.yaml DATA.zarr RUN [key=value ...]`` reads RANK
 and friends.
 """
 
@@ -254,7 +254,7 @@ def require_enough(recipe: TrainingRecipe, available: int, resource: str) -> Non
 def main() -> None:
     """Entry point for torchrun, and for a machine without Ray; see :func:`training.recipes.files.recipe_in`."""
     if len(sys.argv) < 4:
-        print("usage: python -m training RECIPE.yaml|json DATA.zarr RUN [key=value ...]", file=sys.stderr)
+        print("usage: python -m training.engine RECIPE.yaml|json DATA.zarr RUN [key=value ...]", file=sys.stderr)
         sys.exit(2)
     recipe_path, data, run, *words = sys.argv[1:]
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")

@@ -11,7 +11,7 @@ from typing import Any
 
 from datagen.common.files import write_atomically
 from training.engine.state import Job, State
-from training.engine.task import Validation
+from training.engine.tasks.protocol import Validation
 from training.engine.train_step import Learner
 from training.tracking.journal import Journal
 from training.tracking.progress import Progress

@@ -13,7 +13,7 @@ from training.checkpoints.compat import recipe_of
 from training.checkpoints.state_file import unusable_state
 from training.engine.distributed import Ranks, agreed, decided_by_first, restore_random_state
 from training.engine.state import Job, State, Verdict
-from training.engine.task import Named
+from training.engine.tasks.protocol import Named
 from training.engine.train_step import Learner
 from training.recipes.training import TrainingRecipe
 

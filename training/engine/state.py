@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from datagen.common.json_files import fault_in
 from training.data.order import BatchOrder
 from training.engine.distributed import Ranks
-from training.engine.task import Task
+from training.engine.tasks.protocol import Task
 from training.engine.train_step import Learner
 from training.recipes.training import TrainingRecipe
 

@@ -21,7 +21,7 @@ from training.checkpoints.checkpoint import Checkpoint
 from training.checkpoints.weights import fill_network
 from training.engine.distributed import Ranks
 from training.engine.optimization.optimizer import WeightAverage, build_optimiser, build_schedule, load_optimiser
-from training.engine.task import Batch, Task
+from training.engine.tasks.protocol import Batch, Task
 from training.inference.predict import load_weights
 from training.networks.execution import products
 from training.recipes.training import TrainingRecipe

@@ -38,7 +38,7 @@ from training.engine.nonfinite import RecentStep, broken_step, stop_for
 from training.engine.observer import Meter, Observer, observing
 from training.engine.resume import begin, checkpoint_to_resume
 from training.engine.state import Job, State
-from training.engine.tasks import task_of
+from training.engine.tasks.registry import task_of
 from training.recipes.training import TrainingRecipe, budget_seconds
 
 CHECK_EVERY = {"cpu": 1, "cuda": 16}

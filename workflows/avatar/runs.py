@@ -8,8 +8,8 @@ from training.checkpoints.checkpoint import is_finished, load_checkpoint, requir
 from training.checkpoints.weights import fill_network
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
-from training.engine.task import Task
-from training.engine.tasks import task_of
+from training.engine.tasks.protocol import Task
+from training.engine.tasks.registry import task_of
 from training.recipes.training import TrainingRecipe
 from training.tracking.provenance import write_run_head
 from training.tracking.record import update_record

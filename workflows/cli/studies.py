@@ -26,7 +26,7 @@ from workflows.pipeline.console import print_text, server_of
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
     from workflows.pipeline.run_folder import TrialsFolder
-    from workflows.sweep.report import Result
+    from workflows.studies.sweep.report import Result
 
 Kind = Literal["comparison", "ablation"]
 _NAMES: dict[Kind, str] = {"comparison": "compare", "ablation": "ablation"}
@@ -85,7 +85,7 @@ def _ablation_options(made: Parser) -> None:
 
 
 def _comparison_options(made: Parser, kind: Kind) -> None:
-    from workflows.comparison.plan import known_comparisons
+    from workflows.studies.comparison.plan import known_comparisons
 
     add, names = made.add_argument, ", ".join(known_comparisons(kind))
     add("--recipe", default="small", metavar="NAME|FILE", help=f"a YAML file, or one of {names} (default small)")
@@ -114,9 +114,9 @@ def ablation_command(options: argparse.Namespace) -> None:
 
 
 def _compare(options: argparse.Namespace, kind: Kind) -> None:
-    from workflows.comparison.plan import plan_comparison
-    from workflows.comparison.run import folder_of, run_comparison
     from workflows.pipeline.ray_cluster import require_reachable
+    from workflows.studies.comparison.plan import plan_comparison
+    from workflows.studies.comparison.run import folder_of, run_comparison
 
     plan = plan_comparison(options.recipe, options.set, kind=kind)
     out = Path(require_reachable(options.out or f"runs/{_NAMES[kind]}-{plan.name}", option="--out"))
@@ -149,7 +149,7 @@ def _comparison_words(out: Path, server: Server) -> str:
 
 
 def _sweep_options(made: Parser) -> None:
-    from workflows.sweep.plan import known_sweeps
+    from workflows.studies.sweep.plan import known_sweeps
 
     add_recipe_options(made)
     made.set_defaults(recipe=None)
@@ -178,9 +178,9 @@ def sweep_command(options: argparse.Namespace) -> None:
     """
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import SweepFolder
-    from workflows.sweep.plan import plan_sweep
-    from workflows.sweep.report import parse_levels
-    from workflows.sweep.run import Settings, run_sweep
+    from workflows.studies.sweep.plan import plan_sweep
+    from workflows.studies.sweep.report import parse_levels
+    from workflows.studies.sweep.run import Settings, run_sweep
 
     sweep = plan_sweep(recipe=options.recipe, shared=options.set, vary=options.vary, trials=options.trials)
     name = options.name or (Path(options.trials).stem if options.trials else "sweep")
@@ -193,7 +193,7 @@ def sweep_command(options: argparse.Namespace) -> None:
 
 def _sweep_words(results: "list[Result]", out: Path, server: Server) -> str:
     """The table, where everything lies, and how to go on with the best trial."""
-    from workflows.sweep.report import best_of
+    from workflows.studies.sweep.report import best_of
 
     figure = {"figure": "figures/sweep.png"} if (out / "figures" / "sweep.png").exists() else {}
     places = {"table": "sweep.md, sweep.csv", **figure, "runs": "trials/NAME", "dataset": "dataset.zarr"}

@@ -1,1 +1,1 @@
-"""Studies of trained weights."""
+"""Studies: of trained weights (robustness, generalisation), and those that train many (sweep, comparison)."""

@@ -4,7 +4,7 @@ import os
 from typing import Any
 
 from training.engine import launch
-from training.engine.transfer import objective
+from training.engine.tasks.transfer import objective
 
 _real = objective.transfer_loss
 _calls = 0

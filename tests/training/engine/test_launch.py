@@ -129,7 +129,7 @@ def test_a_recipe_that_cannot_be_is_one_line_with_every_fault(
 
 def test_the_command(tmp_path: Path, dataset: str) -> None:
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "training", *map(str, arguments)]
+        command = [sys.executable, "-m", "training.engine", *map(str, arguments)]
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
 
     (tmp_path / "r.json").write_text(json.dumps({"training": tiny_training().model_dump(mode="json")}))

@@ -13,9 +13,9 @@ from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import Checkpoint, require_checkpoint, save_checkpoint
 from training.checkpoints.folder import manifest_of, write_manifest
 from training.engine.distributed import Ranks
+from training.engine.tasks.transfer.transfer_task import TransferTask
 from training.engine.train_step import Learner
 from training.engine.trainer import train
-from training.engine.transfer.task import TransferTask
 from training.inference.predict import load_trained
 from training.recipes.training import ScheduleRecipe, TrainingRecipe
 from training.tracking.journal import read_journal

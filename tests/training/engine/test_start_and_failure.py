@@ -14,8 +14,8 @@ from tests.support.recipes import tiny_dataset, tiny_training
 from training.engine import trainer
 from training.engine.distributed import STOP_FILE, Ranks, agreed, decided_by_first
 from training.engine.state import Verdict
+from training.engine.tasks.transfer import transfer_task, validation
 from training.engine.trainer import train
-from training.engine.transfer import task, validation
 
 ALONE = Ranks(0, 1, 0)
 
@@ -26,7 +26,7 @@ def must_not_be_called(*_: object, **__: object) -> Any:
 
 def test_a_finished_run_opens_neither_meshes_nor_journal(dataset: str, tmp_path: Path, monkeypatch) -> None:
     train(tiny_training(), data=dataset, run=tmp_path)
-    monkeypatch.setattr(task, "open_bank", must_not_be_called)
+    monkeypatch.setattr(transfer_task, "open_bank", must_not_be_called)
     monkeypatch.setattr(trainer, "observing", must_not_be_called)
     assert train(tiny_training(), data=dataset, run=tmp_path) == 8
 
@@ -50,13 +50,13 @@ def test_a_left_over_stop_is_removed_and_one_made_since_is_heeded(dataset: str, 
         os.utime(run / STOP_FILE, (moment, moment))
         assert train(tiny_training(), data=dataset, run=run) == 8
         assert not (run / STOP_FILE).exists()
-    real = task.open_bank
+    real = transfer_task.open_bank
 
     def told_meanwhile(*arguments: Any, **keywords: Any) -> Any:
         (tmp_path / "run" / STOP_FILE).touch()
         return real(*arguments, **keywords)
 
-    monkeypatch.setattr(task, "open_bank", told_meanwhile)
+    monkeypatch.setattr(transfer_task, "open_bank", told_meanwhile)
     with pytest.raises(TrainingStopped, match="step 0 of 8 as told; before anything was learned"):
         train(tiny_training(), data=dataset, run=tmp_path / "run")
 
@@ -74,7 +74,7 @@ def test_a_stop_for_ranks_that_were_not_up_yet_is_kept_where_a_launcher_keeps_it
 def test_early_stopping_without_evaluation_triples_is_refused_first(tmp_path: Path, monkeypatch) -> None:
     data = str(tmp_path / "none.zarr")
     generate(tiny_dataset(triples={"count": 0}), data)
-    monkeypatch.setattr(task, "open_bank", must_not_be_called)
+    monkeypatch.setattr(transfer_task, "open_bank", must_not_be_called)
     with pytest.raises(DatasetError, match=r"early_stopping is 2, but .*none\.zarr lists no evaluation triples"):
         train(tiny_training(early_stopping=2), data=data, run=tmp_path / "run")
 

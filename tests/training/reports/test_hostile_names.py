@@ -48,8 +48,8 @@ from training.viz.transfer_example import Comparison
 from training.viz.transfer_picture import NamedMesh
 from training.viz.viewer import write_viewer
 from workflows.pipeline.console import guarded, print_facts
-from workflows.sweep.plan import plan_sweep
-from workflows.sweep.report import parts_of, results_of, table_csv
+from workflows.studies.sweep.plan import plan_sweep
+from workflows.studies.sweep.report import parts_of, results_of, table_csv
 
 SCRIPT = '"><script>alert(1)</script><img src=x onerror=alert(1)></title><!-- --><style>'
 MARKUP = "![x](http://evil.example/t.png) [y](javascript:alert(1)) | `|` **b** <b> \\ # -"

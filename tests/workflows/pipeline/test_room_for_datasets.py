@@ -19,7 +19,7 @@ from workflows.pipeline import data_size, tasks
 from workflows.pipeline.console import guarded
 from workflows.pipeline.data_size import announce_size
 from workflows.pipeline.ray_cluster import worker_count
-from workflows.sweep.plan import plan_sweep
+from workflows.studies.sweep.plan import plan_sweep
 
 Printed = pytest.CaptureFixture[str]
 SMOKE = ["--recipe", "smoke", "--set", "data.poses.seen=4", "data.poses.unseen=2"]

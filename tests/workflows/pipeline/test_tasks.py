@@ -216,7 +216,9 @@ def test_a_process_that_is_ended_within_its_ray_has_last_words(inside: str, stat
         "from workflows.pipeline.own_ray import own_ray\n"
         f"with own_ray():\n    {inside}"
     )
-    ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    ended = subprocess.run(
+        [sys.executable, "-c", script], check=False, cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert ended.returncode == status
     assert ended.stderr.startswith(said) and len(ended.stderr.splitlines()) == bool(said)
     assert said == "" or ended.stderr.endswith("run the same command again to resume\n")

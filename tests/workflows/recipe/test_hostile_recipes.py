@@ -11,9 +11,9 @@ from datagen.recipe import DatasetRecipe
 from datagen.recipe.text import read_values
 from training.recipes.files import recipe_in
 from workflows.cli import main as cli
-from workflows.comparison.plan import plan_comparison
 from workflows.recipe.loader import change_recipe, load_recipe
-from workflows.sweep.plan import plan_sweep
+from workflows.studies.comparison.plan import plan_comparison
+from workflows.studies.sweep.plan import plan_sweep
 
 READERS: dict[str, Callable[[Path], object]] = {
     "a recipe": lambda path: load_recipe(str(path)),

@@ -1,0 +1,106 @@
+"""Pictures while training, and the curves of the adaptive coefficients."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from datagen.store import open_dataset
+from training.data.batch import Batch, read_batch
+from training.engine.tasks.transfer import snapshots
+from training.engine.tasks.transfer.snapshots import draw_snapshot
+from training.reports.plots.training_curve import draw_coefficients
+from training.tracking.journal import Journal
+
+
+class Returns(nn.Module):
+    """A network that gives what it is told to, and notes the mode it is run in."""
+
+    def __init__(self, output: Tensor) -> None:
+        super().__init__()
+        self.output, self.modes = output, []
+
+    def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+        self.modes.append(self.training)
+        return self.output[: len(source)]
+
+
+@pytest.fixture
+def batch(dataset: str) -> Batch:
+    opened = open_dataset(dataset)
+    return read_batch(opened, opened.evaluation_triples("unseen")[:3])
+
+
+@pytest.fixture
+def faces(dataset: str) -> np.ndarray:
+    return open_dataset(dataset).faces(0)
+
+
+def drawn(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"), int)
+
+
+def column(picture: np.ndarray, number: int) -> np.ndarray:
+    """The panels of a column, without header and captions."""
+    left = 16 + 230 * number
+    return picture[84 + 24 : -16, left : left + 230]
+
+
+def test_four_columns_and_a_row_an_example(batch: Batch, faces: np.ndarray, tmp_path: Path) -> None:
+    network = Returns(batch.truth).train()
+    path = draw_snapshot(network, batch, faces, tmp_path / "step-00001000.png", "step 1,000 of $x$", examples=2)
+    assert path == tmp_path / "step-00001000.png"
+    picture = drawn(path)
+    assert picture.shape == (84 + 2 * 260 + 16, 4 * 230 + 32, 3)
+    shapes = [(column(picture, number).max(2) - column(picture, number).min(2)) > 40 for number in range(3)]
+    assert all(shape.mean() > 0.01 for shape in shapes), "each mesh is seen, in its colour"
+    assert network.modes == [False] and network.training
+
+
+def test_only_the_outputs_are_drawn_again(
+    batch: Batch, faces: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, colors = snapshots.render_mesh, []
+    monkeypatch.setattr(snapshots, "render_mesh", lambda *a, **k: (colors.append(k["colors"]), real(*a, **k))[1])
+    snapshots._given_panel.cache_clear()
+    first = drawn(draw_snapshot(Returns(batch.target), batch, faces, tmp_path / "1.png", "one"))
+    assert len(colors) == 12
+    second = drawn(draw_snapshot(Returns(batch.truth), batch, faces, tmp_path / "2.png", "two"))
+    assert len(colors) == 15 and set(colors[12:]) == {snapshots.ROLE_COLORS["output"]}
+    for number in (0, 1, 3):
+        assert np.array_equal(column(first, number), column(second, number))
+    assert not np.array_equal(column(first, 2), column(second, 2))
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e30])
+def test_a_broken_network_is_drawn_as_it_is(batch: Batch, faces: np.ndarray, tmp_path: Path, value: float) -> None:
+    broken = batch.truth.clone()
+    broken[0, 3] = value
+    path = draw_snapshot(Returns(broken), batch, faces, tmp_path / "x.png", "broken", examples=1)
+    assert (column(drawn(path), 0) < 200).any()
+
+
+@pytest.mark.parametrize("prefix", ["modulation/", ""], ids=["now", "of earlier journals"])
+def test_coefficients_are_drawn_a_panel_a_block(tmp_path: Path, prefix: str) -> None:
+    journal = Journal(tmp_path / "metrics.jsonl")
+    for step in range(0, 100, 10):
+        places = [f"block{b}.norm{n}" for b in (1, 2, 3, 4) for n in (1, 2)]
+        names = [f"{prefix}{kind}/{place}" for kind in ("alpha", "beta") for place in places]
+        journal.write(step, {name: np.sin(step / 30 + place) / 5 for place, name in enumerate(names)})
+    journal.write(100, {"loss/total": 1.0, f"{prefix}alpha/block1.norm1": float("nan")})
+    journal.close()
+    path = draw_coefficients(tmp_path, tmp_path / "figures" / "coefficients.png")
+    assert path is not None
+    picture = drawn(path)
+    assert picture.shape[1] == 1600 and ((picture.max(2) - picture.min(2)) > 60).sum() > 3000
+
+
+def test_no_coefficients_no_figure(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "metrics.jsonl")
+    journal.write(1, {"loss/total": 1.0})
+    journal.close()
+    assert draw_coefficients(tmp_path, tmp_path / "c.png") is None and not (tmp_path / "c.png").exists()
+    assert torch.is_grad_enabled()

@@ -1,0 +1,179 @@
+"""Learning the points of outfits: a frame a row, posed points against the scan's surface (FITE, section 3.3)."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from training.avatar.outfit import Outfit
+from training.avatar.wardrobe import Wardrobe
+from training.data.cache_policy import Room
+from training.engine.distributed import Ranks, agreed
+from training.engine.tasks.avatar.frames import FrameOrder, drawn
+from training.engine.tasks.protocol import Shares
+from training.objectives.point_losses import Edges, Scan, avatar_loss, nearest
+from training.recipes.networks import AvatarRecipe
+from training.recipes.training import TrainingRecipe
+
+_QUIET = 1e-6  # weight of normals before they count
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Position maps [b, view, 3, size, size], transforms [b, bone, 3, 4] and outfits [b] of frames, and their scans."""
+
+    maps: Tensor
+    transforms: Tensor
+    outfits: tuple[int, ...]
+    scans: tuple[Scan, ...]
+
+    def __len__(self) -> int:
+        return len(self.outfits)
+
+    def in_dtype(self, dtype: torch.dtype) -> "FrameBatch":
+        """The same in another floating type."""
+        scans = tuple(Scan(*(its.to(dtype) for its in scan)) for scan in self.scans)
+        return replace(self, maps=self.maps.to(dtype), transforms=self.transforms.to(dtype), scans=scans)
+
+
+class AvatarObjective(nn.Module):
+    """:func:`training.objectives.point_losses.avatar_loss`; normals count from a step on."""
+
+    def __init__(self, network: nn.Module, normals_from: float, edges: Sequence[Edges], roughness: float) -> None:
+        super().__init__()
+        self.network, self._normals_from, self._edges, self._roughness = network, normals_from, edges, roughness
+
+    def forward(self, batch: FrameBatch, *, step: int) -> dict[str, Tensor]:
+        """Return the losses of a batch."""
+        avatar = self.network(batch.maps, batch.transforms, batch.outfits)
+        normals = 1.0 if step >= self._normals_from else _QUIET
+        edges = [self._edges[outfit] for outfit in batch.outfits]
+        loss, parts = avatar_loss(avatar, batch.scans, normals=normals, edges=edges, roughness=self._roughness)
+        return {**parts, "total": loss}
+
+
+class AvatarTask:
+    """See :class:`training.engine.tasks.protocol.Task`; ``outfits``: folders of outfits with templates."""
+
+    def __init__(self, recipe: TrainingRecipe, outfits: Sequence[Outfit], url: str) -> None:
+        assert isinstance(recipe.network, AvatarRecipe)
+        self._recipe, self._network, self._outfits = recipe, recipe.network, outfits
+        self.url = url
+        files = [file for its in outfits for file in (its.subject_file, its.template_file, its.surfaces)]
+        self.uuid = self.sha256 = Outfit.fingerprint(*files)
+        self._wardrobe = Wardrobe.of(outfits, self._network)
+
+    @property
+    def order(self) -> FrameOrder:
+        """Of the seen frames of all outfits."""
+        frames = [subject.seen for subject in self._wardrobe.subjects]
+        return FrameOrder(frames, batch=self._recipe.batch, seed=self._recipe.seed)
+
+    def check(self, room: Room, ranks: int) -> None:
+        """The order says whether there are frames enough."""
+        _ = self.order
+
+    def network(self) -> nn.Module:
+        """Points on the outfits' templates."""
+        return self._wardrobe.network()
+
+    def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
+        """See :class:`AvatarObjective`."""
+        steps = self._recipe.steps or self._recipe.epochs * self.order.steps_per_epoch
+        edges = [its.to(device) for its in self._wardrobe.edges()]
+        return AvatarObjective(network, self._network.normals_from * steps, edges, self._network.roughness)
+
+    @contextmanager
+    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["FrameFeed"]:
+        """Scans' points, in memory."""
+        yield agreed(ranks, lambda: self._feed(ranks, device), what="read the scans")
+
+    def _feed(self, ranks: Ranks, device: torch.device) -> "FrameFeed":
+        return FrameFeed(self._recipe, self._wardrobe.to(device), self._outfits, self.order, ranks, device)
+
+    def validation(self, device: torch.device, dtype: torch.dtype) -> "AvatarValidation":
+        """Measures how far the avatar is from scans."""
+        return AvatarValidation(self._wardrobe, self._outfits, device, dtype)
+
+
+class FrameFeed:
+    """This rank's share of every step's frames, so many points of each scan."""
+
+    where = "memory"
+
+    def __init__(
+        self,
+        recipe: TrainingRecipe,
+        wardrobe: Wardrobe,
+        outfits: Sequence[Outfit],
+        order: FrameOrder,
+        ranks: Ranks,
+        device: torch.device,
+    ) -> None:
+        assert isinstance(recipe.network, AvatarRecipe)
+        self._seed, self._count, self._wardrobe, self._order = recipe.seed, recipe.network.scan_points, wardrobe, order
+        self._surfaces = [its.surface_samples() for its in outfits]
+        self._mine, self._device = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}, device
+
+    def batches(self, first_step: int) -> Shares:
+        """See :class:`training.engine.tasks.protocol.Feed`."""
+        places = self._order.places(**self._mine)
+        for step, share in enumerate(self._order.batches(first_step=first_step, **self._mine), first_step):
+            parts = zip(share, places, strict=True)
+            yield share, [self._batch(rows.tolist(), step, first) for rows, first in parts]
+
+    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> FrameBatch:
+        maps, transforms = self._wardrobe.given(rows)
+        scans = tuple(self._scan(*row, step, first + place) for place, row in enumerate(rows))
+        return FrameBatch(maps, transforms, tuple(outfit for outfit, _ in rows), scans)
+
+    def _scan(self, outfit: int, frame: int, step: int, place: int) -> Scan:
+        points, normals = self._surfaces[outfit].points[frame], self._surfaces[outfit].normals[frame]
+        some = drawn(self._seed, step, place, of=len(points), count=min(self._count, len(points)))
+        return Scan(points[some].to(self._device), normals[some].to(self._device))
+
+
+class AvatarValidation:
+    """``evaluation/plane_seen``, ``plane_unseen``: mm of points from the scans' planes; the latter decides."""
+
+    _FRAMES = 4
+
+    def __init__(self, wardrobe: Wardrobe, outfits: Sequence[Outfit], device: torch.device, dtype: torch.dtype) -> None:
+        self._wardrobe, self._dtype = wardrobe.to(device), dtype
+        self._surfaces = [its.surface_samples() for its in outfits]
+
+    def measure(self, network: nn.Module) -> dict[str, float]:
+        """See the class."""
+        network.eval()
+        try:
+            found = {kind: self._plane(network, kind) for kind in ("seen", "unseen")}
+        finally:
+            network.train()
+        return {f"evaluation/plane_{kind}": value for kind, value in found.items() if value is not None}
+
+    def decisive(self, metrics: dict[str, float]) -> float:
+        """Of unseen poses, where there are."""
+        return metrics.get("evaluation/plane_unseen", metrics.get("evaluation/plane_seen", float("inf")))
+
+    def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
+        """Nothing: the evaluation draws."""
+
+    def _plane(self, network: nn.Module, kind: str) -> float | None:
+        rows = [
+            (number, frame)
+            for number, subject in enumerate(self._wardrobe.subjects)
+            for frame in getattr(subject, kind)[: self._FRAMES]
+        ]
+        posed = self._wardrobe.posed(network, rows, dtype=self._dtype)
+        found = [self._of(row, torch.from_numpy(its.mesh.vertices)) for row, its in zip(rows, posed, strict=True)]
+        return float(np.mean(found)) if found else None
+
+    def _of(self, row: tuple[int, int], points: Tensor) -> float:
+        outfit, frame = row
+        surface, normals = (its[frame].double() for its in vars(self._surfaces[outfit]).values())
+        near = nearest(points, surface)
+        return 1000 * float(((surface[near] - points) * normals[near]).sum(dim=1).abs().mean())

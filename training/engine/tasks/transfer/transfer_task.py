@@ -1,0 +1,91 @@
+"""Pose transfer as the trainer sees it: triples of a dataset, of each network its own objective."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import torch
+from torch import nn
+
+from datagen.store import Dataset
+from training.data.augmentation import Augmentation, Supervise
+from training.data.cache_policy import Room
+from training.data.triples import TripleOrder, order_of
+from training.data.vertex_bank import VertexBank, open_bank
+from training.engine.distributed import Ranks, agreed
+from training.engine.tasks.protocol import Shares
+from training.engine.tasks.transfer.objective import objective_of, supervision_of
+from training.engine.tasks.transfer.step_memory import require_step_memory
+from training.engine.tasks.transfer.validation import TransferValidation, require_measurable
+from training.networks import network_from
+from training.recipes.training import TrainingRecipe
+
+
+class TransferTask:
+    """See :class:`training.engine.tasks.protocol.Task`.
+
+    Parameters
+    ----------
+    recipe
+        What to train and how.
+    dataset
+        A complete one.
+    """
+
+    def __init__(self, recipe: TrainingRecipe, dataset: Dataset) -> None:
+        self._recipe, self._dataset = recipe, dataset
+        self.url, self.uuid = dataset.url, dataset.uuid
+        self.sha256: str = dataset.attributes["manifest_sha256"]
+
+    @property
+    def order(self) -> TripleOrder:
+        """Of its triples (DatasetError where there are too few)."""
+        return order_of(self._recipe, self._dataset)
+
+    def check(self, room: Room, ranks: int) -> None:
+        """See :func:`require_measurable`, :func:`require_step_memory`."""
+        require_measurable(self._dataset, self._recipe)
+        require_step_memory(self._recipe, self._dataset, room, ranks=ranks)
+
+    def network(self) -> nn.Module:
+        """See :func:`training.networks.network_from`."""
+        return network_from(self._recipe.network)
+
+    def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
+        """See :func:`training.engine.tasks.transfer.objective.objective_of`."""
+        return objective_of(network, self._recipe, device)
+
+    @contextmanager
+    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["TripleFeed"]:
+        """The training meshes, decoded, and the rigs of the bodies where a network learns from these."""
+        recipe, dataset = self._recipe, self._dataset
+        with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
+            supervise = agreed(ranks, lambda: supervision_of(recipe, dataset, device), what="read the rigs")
+            yield TripleFeed(recipe, self.order, bank, supervise, ranks)
+
+    def validation(self, device: torch.device, dtype: torch.dtype) -> TransferValidation:
+        """Measures PMD on some of the dataset's evaluation triples."""
+        return TransferValidation(self._dataset, self._recipe, device, dtype)
+
+    def _bank(self, ranks: Ranks, device: torch.device) -> VertexBank:
+        recipe, identities = self._recipe, self._dataset.identities("training")
+        placed: dict[str, Any] = {"device": device, "cache": recipe.cache, "sharers": ranks.here}
+        return open_bank(self._dataset, identities, edge_sum=recipe.edge_sum, **placed)
+
+
+class TripleFeed:
+    """This rank's share of every step's triples, in parts, and their meshes on the device."""
+
+    def __init__(
+        self, recipe: TrainingRecipe, order: TripleOrder, bank: VertexBank, supervise: Supervise, ranks: Ranks
+    ) -> None:
+        self._order, self._bank, self.where = order, bank, bank.where
+        self._augment = Augmentation(recipe, supervise)
+        self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}
+
+    def batches(self, first_step: int) -> Shares:
+        """See :class:`training.engine.tasks.protocol.Feed`."""
+        places, mine = self._order.places(**self._mine), self._order.batches(first_step=first_step, **self._mine)
+        for step, share in enumerate(self._bank.prefetch(mine), first_step):
+            parts = zip(share, places, strict=True)
+            yield share, [self._augment(its, self._bank.batch(its), step=step, first=first) for its, first in parts]
