@@ -64,7 +64,7 @@ class Learner:
         if start:
             load_weights(network, start)
         self.network = network.to(device, self.dtype)
-        self.optimiser = build_optimiser(self.network, recipe)
+        self.optimiser = build_optimiser(self.network, recipe, rank=ranks.rank, ranks=ranks.count)
         self.schedule = build_schedule(self.optimiser, recipe, steps_per_epoch=steps_per_epoch, steps=steps)
         self.average = WeightAverage(self.network, recipe.average) if recipe.average else None
         self._bad_step = torch.zeros((), dtype=torch.int64, device=device)

@@ -28,7 +28,7 @@ def start_ranks(
     data: str,
     run: Path,
     count: int,
-    module: str = "training",
+    module: str = "training.engine",
 ) -> list[subprocess.Popen[str]]:
     """Start ``count`` ranks of ``python -m module RECIPE DATA RUN``."""
     run.parent.mkdir(parents=True, exist_ok=True)

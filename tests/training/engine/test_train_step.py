@@ -53,7 +53,8 @@ CUTS = {
 
 def cut(name: str, **changes: Any) -> TrainingRecipe:
     given = {**TEN, "precision": CUTS[name][0], "average": 0.9, "network": NETWORKS[name.split(maxsplit=1)[0]]}
-    given |= {"augmentation": PARTS["augmentation"]} if name == "parts" else {}
+    if name == "parts":
+        given |= {"augmentation": PARTS["augmentation"], "optimiser": "muon"}
     return tiny_training(**given | changes)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 
 _MOMENTUM = 0.95
@@ -22,6 +23,8 @@ class Muon(torch.optim.AdamW):
 
     PyTorch's own takes matrices alone, one at a time and in bfloat16, which many CPUs have not; here those of one shape
     go together, in their own precision. A parameter of more than two axes is the matrix of its first by the others.
+    Ranks share the work, which in narrow networks is half of a training step: gradients are the same on all, so that
+    each finds the steps of some matrices, and all get them.
 
     Parameters
     ----------
@@ -39,10 +42,13 @@ class Muon(torch.optim.AdamW):
         betas: tuple[float, float],
         eps: float,
         weight_decay: float,
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
         given = list(parameters)
         groups = [{"params": [each for each in given if _is_matrix(each) == kind]} for kind in (True, False)]
         super().__init__(groups, lr=lr, betas=betas, eps=eps, weight_decay=weight_decay, fused=True)
+        self._rank, self._ranks = rank, ranks
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
@@ -59,7 +65,7 @@ class Muon(torch.optim.AdamW):
 
     def _move(self, matrices: list[nn.Parameter], gradients: list[Tensor]) -> None:
         group, bad = self.param_groups[0], getattr(self, "found_inf", None)
-        alike: dict[tuple[int, int], list[tuple[nn.Parameter, Tensor]]] = defaultdict(list)
+        ahead = []
         for parameter, own in zip(matrices, gradients, strict=True):
             state = self.state[parameter]
             if not state:
@@ -67,14 +73,36 @@ class Muon(torch.optim.AdamW):
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
             gradient = own if bad is None else own.masked_fill(bad > 0, 0)
             state["momentum"].lerp_(gradient, (1 - _MOMENTUM) * (1 if bad is None else 1 - bad))
-            ahead = gradient.lerp(state["momentum"], _MOMENTUM).flatten(1)  # Nesterov's
-            alike[ahead.shape[0], ahead.shape[1]].append((parameter, ahead))
+            ahead.append(gradient.lerp(state["momentum"], _MOMENTUM).flatten(1))  # Nesterov's
         moved = torch.tensor(1.0) if bad is None else 1 - bad
-        for (rows, columns), some in alike.items():
-            size = group["lr"] * _SHARE_OF_ADAM * max(rows, columns) ** 0.5
-            for (parameter, _), step in zip(some, orthogonal(torch.stack([own for _, own in some])), strict=True):
-                parameter.mul_(1 - moved * group["lr"] * group["weight_decay"])
-                parameter.sub_(step.view_as(parameter) * (size * moved))
+        for parameter, step in zip(matrices, self._directions(ahead), strict=True):
+            size = group["lr"] * _SHARE_OF_ADAM * max(step.shape) ** 0.5
+            parameter.mul_(1 - moved * group["lr"] * group["weight_decay"])
+            parameter.sub_(step.view_as(parameter) * (size * moved))
+
+    def _directions(self, matrices: Sequence[Tensor]) -> list[Tensor]:
+        """The orthogonal matrix nearest to each, those of one shape together; ranks share them by their cost."""
+        if not matrices:
+            return []
+        loads, mine = [0] * self._ranks, defaultdict(list)
+        for number in sorted(range(len(matrices)), key=lambda number: -_cost(matrices[number])):
+            owner = loads.index(min(loads))
+            loads[owner] += _cost(matrices[number])
+            if owner == self._rank:
+                mine[matrices[number].shape].append(number)
+        found = matrices[0].new_zeros(sum(map(Tensor.numel, matrices)))
+        pieces = found.split([each.numel() for each in matrices])
+        for numbers in mine.values():
+            steps = orthogonal(torch.stack([matrices[number] for number in numbers]))
+            for number, step in zip(numbers, steps, strict=True):
+                pieces[number].copy_(step.flatten())
+        if self._ranks > 1:
+            dist.all_reduce(found)  # others have zeros there
+        return [piece.view_as(each) for piece, each in zip(pieces, matrices, strict=True)]
+
+
+def _cost(matrix: Tensor) -> int:
+    return matrix.numel() * min(matrix.shape)
 
 
 def orthogonal(matrices: Tensor) -> Tensor:

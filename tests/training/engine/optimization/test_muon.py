@@ -110,6 +110,19 @@ def test_it_resumes_to_the_same_bits_and_refuses_the_state_of_others() -> None:
             load_optimiser(resumed, wrong)
 
 
+def test_ranks_share_the_matrices_and_all_take_the_same_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares: list[Tensor] = []
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda found: shares.append(found.clone()))
+    for rank in range(2):
+        own = network()
+        learn(own, build_optimiser(own, RECIPE, rank=rank, ranks=2), range(1))
+    assert not (shares[0] * shares[1]).any() and all(share.any() for share in shares)
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda found: found.copy_(shares[0] + shares[1]))
+    shared, alone = network(), of(RECIPE, 1)[0]
+    learn(shared, build_optimiser(shared, RECIPE, rank=1, ranks=2), range(1))
+    assert all(torch.allclose(*pair, atol=1e-6) for pair in zip(shared.parameters(), alone.parameters(), strict=True))
+
+
 def test_it_learns_in_float64_as_in_float32() -> None:
     exact, rough = network().double(), network()
     for own in (exact, rough):
