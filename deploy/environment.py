@@ -62,7 +62,14 @@ def by_pip(python: Path) -> list[str]:
     index = os.environ.get("TORCH_INDEX", "") or ("" if has_own_indexes(python) else cpu_index())
     if index:
         say(f"torch is looked for at {index}, too")
-    flags = ["--disable-pip-version-check", "--progress-bar", "off", *(["--extra-index-url", index] if index else [])]
+    # Python compiles what is imported, some tenth of all; pip would compile everything: most of the time that it takes
+    flags = [
+        "--disable-pip-version-check",
+        "--progress-bar",
+        "off",
+        "--no-compile",
+        *(["--extra-index-url", index] if index else []),
+    ]
     return [str(python), "-m", "pip", "install", *flags, *WHAT]
 
 

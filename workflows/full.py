@@ -39,8 +39,8 @@ from workflows.cli.declare import (
     recipe_keys,
 )
 from workflows.pipeline.console import guarded, print_text, server_of
-from workflows.pipeline.data_size import announce_size
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
+from workflows.pipeline.forecast import announce_size, announce_times
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
@@ -60,9 +60,16 @@ def main(arguments: list[str] | None = None) -> None:
     with folder.alone():
         if options.fresh:
             folder.remove()
+        announce_times(recipe.data, _not_begun(recipe, folder))
         with Mirror(out, server):
             run_workflow(recipe, out, TaskRunner(local=options.local))
             print_text(closing_words(folder, server, beside=recipe.beside is not None))
+
+
+def _not_begun(recipe: WorkflowRecipe, folder: SingleRunFolder) -> dict[str, TrainingRecipe]:
+    """The trainings of which nothing is there yet; others say by themselves how long they will still take."""
+    trainings = {"train": (recipe.training, folder.run), "train-beside": (recipe.beside, folder.beside)}
+    return {name: training for name, (training, run) in trainings.items() if training and not has_record(run.path)}
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

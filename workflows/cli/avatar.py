@@ -90,7 +90,7 @@ def _train(options: argparse.Namespace) -> None:
     from workflows.avatar.recipe import load_avatar
     from workflows.avatar.run import run_avatar
     from workflows.pipeline.console import print_text, server_of
-    from workflows.pipeline.data_size import announce_size
+    from workflows.pipeline.forecast import announce_size
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import AvatarFolder
     from workflows.pipeline.tasks import TaskRunner

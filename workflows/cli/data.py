@@ -310,7 +310,7 @@ def stand_in_command(options: argparse.Namespace) -> None:
 @contextmanager
 def _runner(options: argparse.Namespace, recipe: "DatasetRecipe", *, anew: bool) -> Iterator[dict[str, Any]]:
     """Where tasks run (here or on Ray, by their size) and what shows their progress, once there is room for all."""
-    from workflows.pipeline.data_size import announce_size
+    from workflows.pipeline.forecast import announce_size
     from workflows.pipeline.generate import generation_bar
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.tasks import TaskRunner

@@ -49,7 +49,7 @@ def _trials_options(made: Parser, one: str) -> None:
 def _at_work(options: argparse.Namespace, folder: "TrialsFolder", data: "DatasetRecipe") -> Iterator[Server]:
     """Hold a folder of trials, started over where that is asked, and mirror it to MLflow while the block runs."""
     from training.tracking.mlflow_mirror import Mirror
-    from workflows.pipeline.data_size import announce_size
+    from workflows.pipeline.forecast import announce_size
 
     if options.cpus_per_trial < 1 or options.gpus_per_trial < 0:
         raise RecipeError(

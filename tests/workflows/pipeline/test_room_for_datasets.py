@@ -15,9 +15,9 @@ from datagen.common.resources import free_disk
 from tests.support.recipes import tiny_dataset
 from workflows import full
 from workflows.cli import main as cli
-from workflows.pipeline import data_size, tasks
+from workflows.pipeline import forecast, tasks
 from workflows.pipeline.console import guarded
-from workflows.pipeline.data_size import announce_size
+from workflows.pipeline.forecast import announce_size
 from workflows.pipeline.ray_cluster import worker_count
 from workflows.studies.sweep.plan import plan_sweep
 
@@ -112,8 +112,8 @@ def test_memory_is_asked_for_the_workers_that_this_machine_has_at_work(
         asked.append(workers)
         return SimpleNamespace(meshes=meshes)
 
-    monkeypatch.setattr(data_size, "size_of", size)
-    monkeypatch.setattr(data_size, "worker_count", lambda: 64)
+    monkeypatch.setattr(forecast, "size_of", size)
+    monkeypatch.setattr(forecast, "worker_count", lambda: 64)
     monkeypatch.setenv("RAY_ADDRESS", address)
     announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True, local=local)
     assert max(asked) == workers
@@ -134,7 +134,7 @@ def test_in_a_container_memory_is_asked_for_the_workers_that_it_may_have(
 
 def test_workers_that_memory_has_no_room_for_may_be_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 1)
-    monkeypatch.setattr(data_size, "worker_count", lambda: 10**9)
+    monkeypatch.setattr(forecast, "worker_count", lambda: 10**9)
     with pytest.raises(RecipeError, match=r"Lower .*, or work in one process: --local, where the command has it"):
         announce_size(tiny_dataset(), str(tmp_path), anew=True, yes=True)
 

@@ -1,4 +1,6 @@
-"""What a dataset will take, reported before it is made; one that memory or the disk has no room for is refused."""
+"""What a dataset and its trainings will take, said before; data that memory or the disk has no room for are refused."""
+
+from collections.abc import Mapping
 
 from datagen.common.errors import DatasetError, RecipeError
 from datagen.recipe import DatasetRecipe
@@ -6,9 +8,14 @@ from datagen.sizes import require_disk, size_of
 from datagen.store import open_dataset
 from datagen.store.objects import is_local, plain
 from datagen.store.schema import check_extent
+from training.recipes.training import TrainingRecipe
+from training.tracking.progress import duration
 from workflows.pipeline.ray_cluster import on_cluster, worker_count
 from workflows.pipeline.stage import say
 from workflows.pipeline.tasks import ray_from
+
+_SOON = 1e6
+"""Vertices in the triples of all steps of a training that is over before a forecast would be worth a word."""
 
 
 def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, local: bool = False) -> None:
@@ -56,3 +63,36 @@ def _is_whole(url: str) -> bool:
     except DatasetError:
         return False
     return True
+
+
+def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe]) -> None:
+    """Say of each training how long it will take on this machine, by trying a few steps; see
+    :func:`training.engine.step_time.seconds_a_step`.
+
+    Nothing is said of what others or GPUs do, of a body whose vertices only its files tell, and of what takes seconds.
+    """
+    if recipe.body.expected_vertices is None or on_cluster():
+        return
+    total, vertices, grid = 0.0, round(recipe.body.expected_vertices), recipe.identities.training * recipe.poses.seen
+    for name, training in trainings.items():
+        steps = training.steps or training.epochs * (grid // training.batch)
+        if steps * training.batch * (training.augmentation.subset or vertices) < _SOON or _on_gpu(training):
+            continue
+        say(f"{name}: trying a few steps, to tell how long {steps:,} will take here")
+        from training.engine.step_time import seconds_a_step  # torch
+
+        seconds = seconds_a_step(training, vertices=vertices)
+        say(f"{name}: {_about(steps * seconds)}, {seconds:.2g} s a step")
+        total += steps * seconds
+    if total:
+        say(f"trainings: {_about(total)} in all; data, evaluation and report take a few minutes more")
+
+
+def _about(seconds: float) -> str:
+    return f"about {duration(60 * max(1, round(seconds / 60)))}"
+
+
+def _on_gpu(recipe: TrainingRecipe) -> bool:
+    import torch
+
+    return recipe.device != "cpu" and torch.cuda.is_available()

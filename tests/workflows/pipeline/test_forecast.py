@@ -1,0 +1,74 @@
+"""How long trainings take is tried and said before anything is made, where this machine's CPU does them."""
+
+import pytest
+import torch
+
+from tests.support.recipes import tiny_training
+from training.engine import step_time
+from training.engine.step_time import seconds_a_step
+from training.recipes.training import TrainingRecipe
+from workflows.pipeline import forecast
+from workflows.pipeline.forecast import announce_times
+from workflows.recipe.loader import load_recipe
+
+LONG = tiny_training(steps=30_000, batch=8, device="cpu")
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The vertices of the meshes that steps were tried with; a step takes 0.01 s."""
+    seen: list[int] = []
+
+    def seconds(recipe: TrainingRecipe, *, vertices: int) -> float:
+        seen.append(vertices)
+        return 0.01
+
+    monkeypatch.setattr(step_time, "seconds_a_step", seconds)
+    monkeypatch.setattr(forecast, "on_cluster", lambda: False)
+    return seen
+
+
+def test_each_training_and_all_of_them_are_told_in_minutes(
+    tried: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = load_recipe("smoke", [])
+    announce_times(recipe.data, {"train": LONG, "train-beside": LONG.model_copy(update={"steps": 60_000})})
+    said = [line.partition("] ")[2] for line in capsys.readouterr().out.splitlines()]
+    assert tried == [96, 96]
+    assert said[0] == "train: trying a few steps, to tell how long 30,000 will take here"
+    assert said[1] == "train: about 5 min, 0.01 s a step" and said[3] == "train-beside: about 10 min, 0.01 s a step"
+    assert said[4].startswith("trainings: about 15 min in all;") and len(said) == 5
+
+
+@pytest.mark.parametrize("case", ["short", "on a GPU", "on a cluster", "vertices that only files tell"])
+def test_what_cannot_be_told_or_is_over_soon_is_not_tried(
+    case: str, tried: list[int], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(forecast, "on_cluster", lambda: case == "on a cluster")
+    body = ["data.body={family: smpl, path: SMPL.npz}"] if case == "vertices that only files tell" else []
+    changes = {"short": {"steps": 10}, "on a GPU": {"device": "auto"}}.get(case, {})
+    announce_times(load_recipe("smoke", body).data, {"train": LONG.model_copy(update=changes)})
+    assert tried == [] and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+@pytest.mark.parametrize("network", ["dsffnet", "parts"])
+def test_steps_of_every_kind_are_tried_and_nothing_of_it_stays(
+    network: str, optimiser: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(step_time, "_SECONDS", 0.0)
+    given = {"network": {"name": network}, "augmentation": {"subset": 20}, "edge_weight": 0}
+    recipe = tiny_training(**given, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
+    before = torch.get_num_threads()
+    assert 0 < seconds_a_step(recipe, vertices=20) < 60
+    assert torch.get_num_threads() == before
+
+
+def test_examples_that_are_too_many_to_try_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(1000))
+    monkeypatch.setattr(step_time, "_SECONDS", 0.0)
+    monkeypatch.setattr(step_time, "_VERTICES", 40)
+    monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
+    few, many = (seconds_a_step(tiny_training(batch=batch), vertices=20) for batch in (2, 8))
+    assert (few, many) == (1 + 1, 4 + 1)  # one second each way, forward and back of a batch of two, the optimiser
