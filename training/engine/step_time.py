@@ -38,7 +38,8 @@ def _tried(recipe: TrainingRecipe, examples: int, times: float, vertices: int) -
     network = network_from(recipe.network)
     optimiser = build_optimiser(network, recipe)
     source, target = torch.rand((2, examples, vertices, 3), generator=torch.Generator().manual_seed(0))
-    seconds, began = [], time.perf_counter()
+    seconds: list[float] = []
+    began = time.perf_counter()
     while len(seconds) < 2 or time.perf_counter() - began < _SECONDS:
         start = time.perf_counter()
         optimiser.zero_grad()

@@ -91,7 +91,7 @@ class Muon(torch.optim.AdamW):
             if owner == self._rank:
                 mine[matrices[number].shape].append(number)
         found = matrices[0].new_zeros(sum(map(Tensor.numel, matrices)))
-        pieces = found.split([each.numel() for each in matrices])
+        pieces = torch.split(found, [each.numel() for each in matrices])
         for numbers in mine.values():
             steps = orthogonal(torch.stack([matrices[number] for number in numbers]))
             for number, step in zip(numbers, steps, strict=True):
