@@ -114,8 +114,7 @@ def _resume(tree: Path) -> None:
 
 
 def _state_of_run(tree: Path) -> None:
-    from training.checkpoints.checkpoint import require_checkpoint
-    from training.checkpoints.compat import recipe_of
+    from training.checkpoints.checkpoint import recipe_of, require_checkpoint
 
     checkpoint = require_checkpoint(tree)
     recipe_of(checkpoint)

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 from torch import Tensor
 
 from datagen.common.errors import CheckpointError, DamagedFileError
@@ -42,6 +43,7 @@ from training.checkpoints.folder import (
 )
 from training.checkpoints.state_file import read_state
 from training.checkpoints.weights import cast_weights, read_header, read_weights
+from training.recipes.training import TrainingRecipe
 
 __all__ = [
     "Checkpoint",
@@ -275,3 +277,32 @@ def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
         last_step=about.get("last_step"),
         has_average=AVERAGE in about.get("sha256", {}),
     )
+
+
+def recipe_of(checkpoint: Checkpoint, *, network_only: bool = False) -> TrainingRecipe:
+    """Return the recipe that a checkpoint was trained by.
+
+    ``network_only``: where no more than the network is wanted, what this version does not know of the rest is left out.
+
+    Raises
+    ------
+    CheckpointError
+        It holds no recipe, or one that this version cannot read; the message names the field.
+    """
+    values = checkpoint.recipe
+    if not values:
+        raise CheckpointError(
+            f"{checkpoint.path} holds weights without their recipe. Name a run, or weights exported from one"
+        )
+    try:
+        return TrainingRecipe.model_validate(values)
+    except ValidationError as error:
+        if network_only and all(fault["loc"][:1] != ("network",) for fault in error.errors()):
+            log.warning("%s was trained by a recipe that this version cannot read whole", checkpoint.path)
+            return TrainingRecipe.model_validate({"network": values.get("network", {})})
+        fault = error.errors()[0]
+        place = ".".join(("training", *(str(part) for part in fault["loc"])))
+        raise CheckpointError(
+            f"{checkpoint.path} was trained by a recipe that this version cannot read ({place}: {fault['msg']}); "
+            "it was written by another version. Train anew in another --out, or use the version that wrote it"
+        ) from error

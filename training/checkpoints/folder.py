@@ -23,8 +23,16 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from datagen.common.errors import DamagedFileError, UnsafeFileError, storage_errors
-from datagen.common.files import open_regular, read_within, resolve_within, sha256_of, sync_folder, write_atomically
-from datagen.common.json_files import fault_in, warn_once
+from datagen.common.files import (
+    fault_in,
+    open_regular,
+    read_within,
+    resolve_within,
+    sha256_of,
+    sync_folder,
+    warn_once,
+    write_atomically,
+)
 from training.checkpoints.weights import About, about_in, write_weights
 
 WEIGHTS, AVERAGE, STATE, MANIFEST = "weights.safetensors", "average.safetensors", "state.pt", "manifest.json"

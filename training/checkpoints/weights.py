@@ -19,8 +19,7 @@ from safetensors.torch import load_file, save, save_file
 from torch import Tensor, nn
 
 from datagen.common.errors import CheckpointError, reason_of
-from datagen.common.files import open_regular, write_atomically
-from datagen.common.json_files import fault_in
+from datagen.common.files import fault_in, open_regular, write_atomically
 
 _HEADER, _NAMED_AT_MOST = "dsffnet", 3
 _SHORTEST_HEADER = 2  # bytes of an empty JSON object

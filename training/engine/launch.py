@@ -21,8 +21,7 @@ from pydantic import Field, TypeAdapter
 from typing_extensions import TypedDict
 
 from datagen.common.errors import DsffnetError, TrainingError, TrainingStopped
-from datagen.common.files import read_within, write_atomically
-from datagen.common.json_files import read_json_if_whole, set_aside
+from datagen.common.files import read_json_if_whole, read_within, set_aside, write_atomically
 from datagen.common.printable import printable
 from training.engine.distributed import STOP_FILE, Ranks, device_of
 from training.engine.trainer import train

@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from datagen.common.errors import CheckpointError, reason_of
-from training.checkpoints.checkpoint import Checkpoint, load_checkpoint, read_checkpoint, require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import Checkpoint, load_checkpoint, read_checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.state_file import unusable_state
 from training.engine.distributed import Ranks, agreed, decided_by_first, restore_random_state
 from training.engine.state import Job, State, Verdict

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from datagen.common.json_files import fault_in
+from datagen.common.files import fault_in
 from training.data.order import BatchOrder
 from training.engine.distributed import Ranks
 from training.engine.tasks.protocol import Task

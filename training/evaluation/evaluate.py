@@ -20,8 +20,7 @@ from datagen.common.files import sha256_of
 from datagen.common.resources import bytes_text, free_memory
 from datagen.grid import PoseType
 from datagen.store import Dataset, open_dataset
-from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of
 from training.evaluation.measure import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
 from training.evaluation.paper_numbers import method_name, needs_equal_counts

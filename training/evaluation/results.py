@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from datagen.common.errors import DamagedFileError, UnsafeFileError
-from datagen.common.files import read_text_within, write_atomically
-from datagen.common.json_files import SET_ASIDE, set_aside, warn_once
+from datagen.common.files import SET_ASIDE, read_text_within, set_aside, warn_once, write_atomically
 
 _LONGEST = 2**29  # bytes: two million rows
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.mesh.geometry import Mesh, edges_of
-from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import Checkpoint, Which, recipe_of, require_checkpoint
 from training.checkpoints.weights import fill_network
 from training.networks import network_from
 from training.networks.execution import GraphedTransfer

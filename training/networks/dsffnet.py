@@ -7,10 +7,10 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.layers.autocast_centering import centred_for_autocast
 from training.networks.layers.input_checks import check_norm_weights, check_vertices
 from training.networks.layers.modulation import (
     FFAdaIN,
+    centred_for_autocast,
     full_precision,
     homogeneous,
     modulated_relu,

@@ -11,8 +11,7 @@ import torch
 from datagen.common.files import sha256_of
 from datagen.store import Dataset
 from datagen.store.verify import describe
-from training.checkpoints.checkpoint import Checkpoint, require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.folder import AVERAGE, WEIGHTS
 from training.evaluation.document import Table, Text, plain
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row

@@ -12,8 +12,7 @@ from datagen.common.errors import ReportError
 from datagen.common.files import write_atomically
 from datagen.common.printable import printable_lines
 from datagen.store import Dataset, open_dataset
-from training.checkpoints.checkpoint import require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import recipe_of, require_checkpoint
 from training.evaluation.document import Cell, Table, Text, plain, with_best
 from training.evaluation.evaluate import NO_OPS, Row, read_rows
 from training.evaluation.paper_numbers import method_name

@@ -13,8 +13,7 @@ from pydantic import Field, TypeAdapter
 from typing_extensions import TypedDict
 
 from datagen.common.errors import DamagedFileError, ReportError, UnsafeFileError
-from datagen.common.files import read_text_within
-from datagen.common.json_files import read_json
+from datagen.common.files import read_json, read_text_within
 from training.evaluation.document import Table
 from training.reports.blocks import Block, Code, Facts, Section, shown
 from training.tracking.journal import read_journal

@@ -16,8 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field, Strict, TypeAdapter, ValidationError
 
 from datagen.common.errors import storage_errors
-from datagen.common.files import open_regular, resolve_within
-from datagen.common.json_files import warn_once
+from datagen.common.files import open_regular, resolve_within, warn_once
 
 _Whole = Annotated[int, Field(strict=True, gt=-(2**63), lt=2**63)]
 _ROW: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, _Whole | Annotated[float, Strict()]])

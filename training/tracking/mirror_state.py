@@ -13,8 +13,7 @@ from pydantic import ConfigDict, Field, TypeAdapter
 from typing_extensions import TypedDict
 
 from datagen.common.errors import UnsafeFileError
-from datagen.common.files import resolve_within, write_atomically
-from datagen.common.json_files import read_json_if_whole, set_aside, warn_once
+from datagen.common.files import read_json_if_whole, resolve_within, set_aside, warn_once, write_atomically
 from training.tracking.journal import journal_from
 
 NOTE = "mlflow.json"

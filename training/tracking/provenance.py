@@ -12,8 +12,7 @@ from typing import Any
 from pydantic import ConfigDict, TypeAdapter
 from typing_extensions import TypedDict
 
-from datagen.common.files import write_atomically
-from datagen.common.json_files import read_json_if_whole
+from datagen.common.files import read_json_if_whole, write_atomically
 
 FILE = "provenance.json"
 

@@ -19,8 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
-from datagen.common.files import write_atomically
-from datagen.common.json_files import read_json_if_whole, set_aside
+from datagen.common.files import read_json_if_whole, set_aside, write_atomically
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 Milliseconds = Annotated[int, Field(ge=0, lt=253_402_300_800_000)]

@@ -23,8 +23,7 @@ from datagen.mesh.rig import skinned
 from training.avatar.metrics import Surface, score
 from training.avatar.outfit import outfits_in
 from training.avatar.wardrobe import Posed, Wardrobe
-from training.checkpoints.checkpoint import require_checkpoint
-from training.checkpoints.compat import recipe_of
+from training.checkpoints.checkpoint import recipe_of, require_checkpoint
 from training.recipes.networks import AvatarRecipe
 from training.tracking.record import update_record
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing

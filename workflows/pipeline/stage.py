@@ -13,8 +13,7 @@ from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
 from datagen.common.errors import TrainingStopped
-from datagen.common.files import refuse_links_out, write_atomically
-from datagen.common.json_files import read_json_if_whole
+from datagen.common.files import read_json_if_whole, refuse_links_out, write_atomically
 from datagen.common.printable import printable
 from training.tracking.record import begin_record, end_record, flatten
 

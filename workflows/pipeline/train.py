@@ -8,14 +8,13 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from datagen.common.errors import DsffnetError, TrainingError
-from datagen.common.files import refuse_links_out, resolve_within
-from datagen.common.json_files import read_json_if_whole
+from datagen.common.files import read_json_if_whole, refuse_links_out, resolve_within
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.checkpoints.checkpoint import is_finished, load_checkpoint, require_checkpoint
-from training.data.triples import last_step_of, order_of
+from training.data.order import last_step_of, order_of
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
 from training.evaluation.tables import about_model

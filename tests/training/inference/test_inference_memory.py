@@ -9,8 +9,12 @@ from torch import Tensor
 from tests.support.three_networks import FORMS, lively, pair
 from training.networks.dsffnet import DSFFNet
 from training.networks.layers import modulation
-from training.networks.layers.autocast_centering import centred_for_autocast
-from training.networks.layers.modulation import homogeneous, modulated_relu, rounded_modulated_relu
+from training.networks.layers.modulation import (
+    centred_for_autocast,
+    homogeneous,
+    modulated_relu,
+    rounded_modulated_relu,
+)
 
 DTYPES = [torch.bfloat16, torch.float16]
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from datagen.common.errors import DsffnetError
-from datagen.common.files import write_atomically
-from datagen.common.json_files import read_json
+from datagen.common.files import read_json, write_atomically
 from datagen.generate import ray_runner
 from datagen.store import Dataset
 from training.checkpoints.checkpoint import require_checkpoint

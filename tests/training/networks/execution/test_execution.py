@@ -118,7 +118,7 @@ def test_the_constants_taken_before_rounding_change_nothing(monkeypatch: pytest.
 
 
 def test_features_far_from_zero_keep_their_differences_under_autocast() -> None:
-    from training.networks.layers.autocast_centering import centred_for_autocast
+    from training.networks.layers.modulation import centred_for_autocast
 
     torch.manual_seed(0)
     features = (torch.rand(2, 64, 5) + 1000).requires_grad_()

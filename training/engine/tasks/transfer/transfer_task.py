@@ -10,7 +10,7 @@ from torch import nn
 from datagen.store import Dataset
 from training.data.augmentation import Augmentation, Supervise
 from training.data.cache_policy import Room
-from training.data.triples import TripleOrder, order_of
+from training.data.order import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import Ranks, agreed
 from training.engine.tasks.protocol import Shares

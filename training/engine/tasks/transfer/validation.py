@@ -13,7 +13,7 @@ from datagen.common.arrays import Integers
 from datagen.common.errors import DatasetError
 from datagen.store import Dataset
 from training.data.batch import Batch, read_batch
-from training.data.triples import Triples
+from training.data.order import Triples
 from training.engine.tasks.transfer.snapshots import draw_snapshot
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
