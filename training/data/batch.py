@@ -15,8 +15,7 @@ from datagen.store import Dataset
 from training.data.order import Triples
 from training.data.vertex_layout import normalised
 from training.networks.layers.surface import Surface, joined, surface_of
-from training.objectives.edge_incidence import INCIDENCES, incidence_of, join_incidences
-from training.objectives.losses import PackedEdges, loss_edges
+from training.objectives.losses import INCIDENCES, PackedEdges, incidence_of, join_incidences, loss_edges
 from training.objectives.parts import Posed
 
 Counts = tuple[int, ...]

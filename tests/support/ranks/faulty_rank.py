@@ -4,9 +4,9 @@ import os
 from typing import Any
 
 from training.engine import launch
-from training.engine.tasks.transfer import objective
+from training.engine.tasks.transfer import transfer_task
 
-_real = objective.transfer_loss
+_real = transfer_task.transfer_loss
 _calls = 0
 
 
@@ -20,5 +20,5 @@ def _faulty(*arguments: Any, **keywords: Any) -> Any:
 
 
 if __name__ == "__main__":
-    objective.transfer_loss = _faulty
+    transfer_task.transfer_loss = _faulty
     launch.main()

@@ -20,7 +20,7 @@ from training.data.vertex_bank import open_bank
 from training.networks.dsffnet import DSFFNet
 from training.networks.layers.surface import surface_of
 from training.networks.padded_batches import MixedCounts
-from training.objectives.edge_incidence import INCIDENCES, incidence_of, make_incidence
+from training.objectives.losses import INCIDENCES, incidence_of, make_incidence
 
 TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [4, 2, 0, 1]])
 

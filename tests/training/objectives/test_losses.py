@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from training.objectives import edge_incidence as incidence
+from training.objectives import losses as incidence
 from training.objectives.losses import (
     edge_length_loss,
     loss_edges,

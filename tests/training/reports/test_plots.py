@@ -16,10 +16,10 @@ from training.evaluation.evaluate import Row
 from training.evaluation.run_curves import RunCurve
 from training.reports.plots import ablation, convergence, sweep, training_curve
 from training.reports.plots.ablation import ablation_figure
-from training.reports.plots.axes import apart
 from training.reports.plots.convergence import convergence_figure, learning_of
 from training.reports.plots.sweep import sweep_figure
 from training.viz.mesh_grid import contact_sheet
+from training.viz.style import apart
 
 
 def run_of(folder: Path, *, level: float, steps: int = 40) -> Path:

@@ -12,8 +12,7 @@ from matplotlib.lines import Line2D
 
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.evaluation.statistics import mean_and_interval
-from training.reports.plots.axes import logarithmic, style_axes
-from training.viz.style import DPI, INK, PAGE, QUIET, RULE, method_colors, saved
+from training.viz.style import DPI, INK, PAGE, QUIET, RULE, logarithmic, method_colors, saved, style_axes
 
 _METRICS = (("PMD (1e-4)", "pmd", 1e4), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
 _OFFSETS = {"seen": 0.17, "unseen": -0.17}

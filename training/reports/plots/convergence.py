@@ -14,9 +14,8 @@ from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
 from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
 from training.recipes.files import recipe_in
-from training.reports.plots.axes import EndLabel, dashed_level, label_ends, style_learning
 from training.tracking.journal import read_journal
-from training.viz.style import DPI, INK, PAGE, method_colors, saved
+from training.viz.style import DPI, INK, PAGE, EndLabel, dashed_level, label_ends, method_colors, saved, style_learning
 
 _LEFT, _AXES, _HEIGHT, _TOP, _BOTTOM, _LETTER = 0.62, 3.7, 3.1, 0.52, 0.5, 0.068  # inches
 _LABEL_POINTS = 11.0

@@ -12,9 +12,8 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, in_words, transfer_each
 from training.evaluation.robustness import Case, RobustnessRow, curve, disturbed, methods_in, no_op, refusal
-from training.reports.plots.axes import logarithmic, style_axes
 from training.viz.mesh_grid import Panel, Row, drawable, mesh_grid, standing
-from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, method_colors, saved, short
+from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, logarithmic, method_colors, saved, short, style_axes
 
 _ABREAST = 5
 _BODY_METRES = 1.7

@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from training.evaluation.run_curves import PMD_UNIT, RunCurve
-from training.reports.plots.axes import EndLabel, dashed_level, label_ends, style_learning
-from training.viz.style import DPI, INK, PAGE, QUIET, saved
+from training.viz.style import DPI, INK, PAGE, QUIET, EndLabel, dashed_level, label_ends, saved, style_learning
 
 _BEST = "#d1462f"
 _OTHERS = ("#3f74c8", "#2f9e83", "#a868b8", "#c98a1b", "#4aa3bf")

@@ -11,9 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from datagen.common.arrays import Floats
-from training.reports.plots.axes import apart, dashed_level, style_axes
 from training.tracking.journal import read_journal
-from training.viz.style import DPI, INK, PAGE, saved
+from training.viz.style import DPI, INK, PAGE, apart, dashed_level, saved, style_axes
 
 
 def training_curve(
