@@ -16,7 +16,7 @@ from training.engine.trainer import train
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, write_rows
 from training.evaluation.tables import report
 from training.networks import network_from
-from training.reports.examples import draw_training_curve
+from training.reports.plots.training_curve import draw_training_curve
 from training.tracking.record import begin_record, end_record, update_record
 
 

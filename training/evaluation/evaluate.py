@@ -23,7 +23,6 @@ from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of
 from training.evaluation.measure import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
-from training.evaluation.paper_numbers import method_name, needs_equal_counts
 from training.evaluation.results import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows
 from training.recipes.training import EvaluationRecipe, NetworkRecipe
 
@@ -37,8 +36,6 @@ __all__ = [
     "evaluation_list",
     "fingerprint_of",
     "measure_chunk",
-    "method_name",
-    "needs_equal_counts",
     "read_rows",
     "require_pairable",
     "triples_in",
@@ -146,7 +143,7 @@ def require_pairable(name: str, network: NetworkRecipe, source: int, target: int
     EvaluationError
         Naming the method, the counts and ``where`` they are.
     """
-    if needs_equal_counts(network) and source != target:
+    if network.needs_equal_counts and source != target:
         raise EvaluationError(
             f"{name} pairs source and target vertex by vertex (training.network.variant 'origin'), but {where} has a "
             f"source of {source:,} vertices and a target of {target:,}. Evaluate it on a dataset of one vertex count, "

@@ -21,7 +21,6 @@ from datagen.grid import PoseType
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
-from training.evaluation.paper_numbers import method_name, needs_equal_counts
 from training.evaluation.results import Row, Score
 from training.inference.predict import load_trained, predict, surfaces_of, takes_surfaces
 from training.inference.projection import OntoParts
@@ -199,10 +198,10 @@ def load_methods(places: Sequence[Path], *, labels: Sequence[str]) -> list[Loade
         A place has no usable weights.
     """
     loaded = [load_trained(place) for place in places]
-    titles = [method_name(recipe.network) for _, recipe, _ in loaded]
+    titles = [recipe.network.title for _, recipe, _ in loaded]
     names = _told_apart(titles, labels)
     return [
-        LoadedMethod(name, network, step, str(place), _EQUAL_COUNTS if needs_equal_counts(recipe.network) else "")
+        LoadedMethod(name, network, step, str(place), _EQUAL_COUNTS if recipe.network.needs_equal_counts else "")
         for name, place, (network, recipe, step) in zip(names, places, loaded, strict=True)
     ]
 

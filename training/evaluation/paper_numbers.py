@@ -8,19 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from training.recipes.networks import AvatarRecipe, TemplateRecipe
-from training.recipes.training import CoreNet3dRecipe, NetworkRecipe, NptRecipe, PartsRecipe
+from training.recipes.networks import (
+    CORENET3D,
+    DSFFNET,
+    NPT,
+    WITHOUT_EDGE_LOSS,
+    WITHOUT_FUSION,
+    WITHOUT_TARGET_SIDE,
+)
 
 PaperData = Literal["SMPL", "SMAL"]
 """Humans and animals of the paper."""
-
-DSFFNET, NPT, CORENET3D = "DSFFNet", "NPT", "3D-CoreNet"
-"""The three networks, by the paper's names."""
-PARTS = "Parts (from rigs)"
-"""No paper's: its supervision is said wherever its name is."""
-
-WITHOUT_FUSION, WITHOUT_TARGET_SIDE, WITHOUT_EDGE_LOSS = "w/o FFAdaIN", "w/o side target", "w/o L_edge"
-"""The ablations of DSFFNet, by the paper's names (Table 3)."""
 
 INFERENCE_DEVICE = "RTX 3080"
 """The GPU that the paper's inference times are of."""
@@ -79,23 +77,3 @@ TABLE_3: Mapping[str, SeenUnseen] = {
     WITHOUT_EDGE_LOSS: SeenUnseen(Scores(0.91, 3.67, 22.49), Scores(2.12, 7.82, 42.63)),
 }
 """Table 3 (SMPL) by ablation, the full DSFFNet first."""
-
-
-def method_name(network: NetworkRecipe) -> str:
-    """What tables call a network, by its recipe: the paper's name, with what is left out or differs behind it."""
-    if isinstance(network, PartsRecipe):
-        return PARTS
-    if isinstance(network, CoreNet3dRecipe):
-        return CORENET3D
-    if isinstance(network, NptRecipe):
-        return NPT if network.variant == "maxpool" else f"{NPT} {network.variant}"
-    if isinstance(network, TemplateRecipe | AvatarRecipe):
-        return f"FITE {network.name}"
-    if not network.feature_fusion:
-        return f"{DSFFNET} {WITHOUT_FUSION}"
-    return DSFFNET if network.target_side else f"{DSFFNET} {WITHOUT_TARGET_SIDE}"
-
-
-def needs_equal_counts(network: NetworkRecipe) -> bool:
-    """Whether a network pairs source and target by index, so that both must have as many vertices."""
-    return isinstance(network, NptRecipe) and network.variant == "origin"

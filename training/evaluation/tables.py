@@ -13,7 +13,7 @@ from training.evaluation.measure import NO_OPS, POSE_TYPES
 from training.evaluation.results import Row
 from training.evaluation.statistics import BOOTSTRAP, differences, interval, spread_over, values_of
 from training.evaluation.timing import Inference
-from training.recipes.networks import NetworkRecipe
+from training.recipes.networks import DSFFNET
 
 THEIRS = "paper"
 """What the cell begins with that marks a line as a paper's own numbers."""
@@ -98,18 +98,6 @@ def about_weights(steps: Mapping[str, int], dataset: Dataset) -> str:
     """What was measured on what, as markup for :func:`results`; ``steps`` of each method's training."""
     told = ", ".join(f"{step:,}{f' ({plain(name)})' if len(steps) > 1 else ''}" for name, step in steps.items())
     return f"Weights of step {told} on {plain(PurePosixPath(dataset.url).name)} ({dataset.uuid})."
-
-
-def about_model(network: NetworkRecipe, step: int, dataset: Dataset, pmd: Mapping[str, float]) -> str:
-    """Weights in two paragraphs of markup: on what they were trained, and their PMD by pose type."""
-    people, poses = len(dataset.identities("training")), len(dataset.grid.poses("seen"))
-    name = plain(PurePosixPath(dataset.url).name)
-    scores = ", ".join(f"{value * 1e4:.2f}e-4 in {pose_type} poses" for pose_type, value in pmd.items())
-    return (
-        f"{plain(paper.method_name(network))}, step {step:,} of a training on {name}: {dataset.recipe.body.family} "
-        f"bodies, {people:,} identities in {poses:,} poses ({dataset.uuid}).\n\n"
-        f"PMD of new identities: {scores or 'not measured'}."
-    )
 
 
 def results(rows: Sequence[Row], *, about: str, emd_points: int) -> tuple[Text | Table, ...]:
@@ -244,7 +232,7 @@ def _cells(scores: paper.SeenUnseen) -> list[str]:
 
 def _short(method: str) -> str:
     """An ablation's name as the paper has it, without the network's."""
-    return method.removeprefix(f"{paper.DSFFNET} ")
+    return method.removeprefix(f"{DSFFNET} ")
 
 
 def _in_papers_order(methods: Iterable[str]) -> list[str]:
@@ -254,7 +242,7 @@ def _in_papers_order(methods: Iterable[str]) -> list[str]:
 
 
 def _reference(methods: Sequence[str]) -> str:
-    return paper.DSFFNET if paper.DSFFNET in methods else methods[0]
+    return DSFFNET if DSFFNET in methods else methods[0]
 
 
 def _mean(rows: Iterable[Row], method: str, pose_type: str, column: Column) -> str:

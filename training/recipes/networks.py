@@ -6,6 +6,11 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from datagen.recipe import Frozen
 
+DSFFNET, NPT, CORENET3D = "DSFFNet", "NPT", "3D-CoreNet"
+"""The three networks, by the paper's names."""
+WITHOUT_FUSION, WITHOUT_TARGET_SIDE, WITHOUT_EDGE_LOSS = "w/o FFAdaIN", "w/o side target", "w/o L_edge"
+"""The ablations of DSFFNet, by the paper's names (Table 3)."""
+
 Widths = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
 NormWeights = Annotated[
     Literal["uniform", "area"],
@@ -13,7 +18,21 @@ NormWeights = Annotated[
 ]
 
 
-class DsffnetRecipe(Frozen):
+class NetworkSection(Frozen):
+    """Base of the sections of networks."""
+
+    @property
+    def title(self) -> str:
+        """What tables call the network: the paper's name, with what is left out or differs after it."""
+        raise NotImplementedError
+
+    @property
+    def needs_equal_counts(self) -> bool:
+        """Whether it pairs source and target by index, so that both must have as many vertices."""
+        return False
+
+
+class DsffnetRecipe(NetworkSection):
     """DSFFNet; the defaults are the paper's (9,371,023 parameters)."""
 
     name: Literal["dsffnet"] = Field("dsffnet", description="network, see training.networks")
@@ -34,8 +53,14 @@ class DsffnetRecipe(Frozen):
             )
         return self
 
+    @property
+    def title(self) -> str:
+        if not self.feature_fusion:
+            return f"{DSFFNET} {WITHOUT_FUSION}"
+        return DSFFNET if self.target_side else f"{DSFFNET} {WITHOUT_TARGET_SIDE}"
 
-class NptRecipe(Frozen):
+
+class NptRecipe(NetworkSection):
     """The baseline NPT; the defaults are its released code's (6,054,941 parameters)."""
 
     name: Literal["npt"] = Field("npt", description="network, see training.networks")
@@ -46,6 +71,14 @@ class NptRecipe(Frozen):
     encoder_widths: Widths = Field((64, 128, 1024), description="channels of the pose encoder; the decoder's follow")
     norm_weights: NormWeights = "uniform"
 
+    @property
+    def title(self) -> str:
+        return NPT if self.variant == "maxpool" else f"{NPT} {self.variant}"
+
+    @property
+    def needs_equal_counts(self) -> bool:
+        return self.variant == "origin"
+
 
 def _with_network_name(values: Any) -> Any:
     """Recipes that name no network mean DSFFNet."""
@@ -55,7 +88,7 @@ def _with_network_name(values: Any) -> Any:
 DEFAULT_NETWORK = "dsffnet"
 
 
-class CoreNet3dRecipe(Frozen):
+class CoreNet3dRecipe(NetworkSection):
     """3D-CoreNet; the defaults are the paper's (24,461,447 parameters)."""
 
     name: Literal["corenet3d"] = "corenet3d"
@@ -64,8 +97,12 @@ class CoreNet3dRecipe(Frozen):
     centre_features: bool = Field(False, description="centre features over channels before they are compared")
     norm_weights: NormWeights = "uniform"
 
+    @property
+    def title(self) -> str:
+        return CORENET3D
 
-class PartsRecipe(Frozen):
+
+class PartsRecipe(NetworkSection):
     """The parts network, which learns from datasets with rigs; no paper's."""
 
     name: Literal["parts"] = "parts"
@@ -88,8 +125,12 @@ class PartsRecipe(Frozen):
             raise ValueError("joints names none")
         return joints
 
+    @property
+    def title(self) -> str:
+        return "Parts (from rigs)"  # its supervision is said wherever its name is
 
-class TemplateRecipe(Frozen):
+
+class TemplateRecipe(NetworkSection):
     """FITE's implicit template of an outfit; the defaults are the released sizes (465,708 parameters)."""
 
     name: Literal["template"] = "template"
@@ -97,8 +138,12 @@ class TemplateRecipe(Frozen):
     points: int = Field(5625, ge=8, description="points around each scan that a step takes, others each time")
     hand_points: int = Field(500, ge=1, description="points around the body's hands that a step takes")
 
+    @property
+    def title(self) -> str:
+        return f"FITE {self.name}"
 
-class AvatarRecipe(Frozen):
+
+class AvatarRecipe(NetworkSection):
     """FITE's point avatar; the defaults are the released sizes (9,969,417 parameters beside the points' features)."""
 
     name: Literal["avatar"] = "avatar"
@@ -123,6 +168,10 @@ class AvatarRecipe(Frozen):
     def sizes(self) -> dict[str, Any]:
         """Those of the network; the rest says how it is trained."""
         return self.model_dump(exclude={"name", "scan_points", "normals_from", "roughness"})
+
+    @property
+    def title(self) -> str:
+        return f"FITE {self.name}"
 
     @field_validator("map_size")
     @classmethod

@@ -1,4 +1,4 @@
-"""What a person looks at after an evaluation: figure of examples, training curve, GLB files and the HTML viewer."""
+"""What a person looks at after an evaluation: figure of examples, GLB files and the HTML viewer."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,8 +16,6 @@ from training.data.batch import read_batch
 from training.evaluation.evaluate import POSE_TYPES, Row, evaluation_list
 from training.inference.predict import predict, takes_surfaces
 from training.recipes.training import EvaluationRecipe
-from training.reports.plots.training_curve import training_curve
-from training.tracking.journal import read_journal
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_example import Comparison
 from training.viz.viewer import write_viewer
@@ -55,11 +53,6 @@ def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: 
         for name, mesh in comparison.meshes().items():
             role = "output" if name.startswith("output ") and len(comparison.outputs) == 1 else _file_name(name)
             save_mesh(Mesh(mesh.vertices, mesh.faces), folder / "meshes" / f"{number:02d}-{role}.glb")
-
-
-def draw_training_curve(run: Path, path: Path, *, baselines: dict[str, float]) -> None:
-    """Loss and evaluation PMD over the steps of a run; ``baselines`` are dashed lines."""
-    training_curve(read_journal(run / "metrics.jsonl"), path, baselines=baselines)
 
 
 _Numbers = Mapping[tuple[str, str, int], Row]

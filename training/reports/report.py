@@ -15,7 +15,6 @@ from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import recipe_of, require_checkpoint
 from training.evaluation.document import Cell, Table, Text, plain, with_best
 from training.evaluation.evaluate import NO_OPS, Row, read_rows
-from training.evaluation.paper_numbers import method_name
 from training.evaluation.tables import about_weights, mean_of, methods_of, results
 from training.inference.projection import PROJECTED
 from training.recipes.training import EvaluationRecipe
@@ -153,7 +152,7 @@ def _runs(out: Path, rows: Sequence[Row]) -> dict[str, Path]:
 
 
 def _name_of(run: Path) -> str:
-    return method_name(recipe_of(require_checkpoint(run, "result")).network)
+    return recipe_of(require_checkpoint(run, "result")).network.title
 
 
 def _of(name: str, runs: Mapping[str, Path]) -> str:

@@ -20,8 +20,7 @@ from datagen.common.errors import DsffnetError, TrackingError, UnsafeFileError
 from datagen.common.files import lock_within
 from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
-from training.tracking.mlflow_pages import EXPERIMENT_TAGS, mark_experiment
-from training.tracking.mlflow_store import prepare_store, require_inside
+from training.tracking.mlflow_store import EXPERIMENT_TAGS, mark_experiment, prepare_store, require_inside
 from training.tracking.model_registry import Registration
 from training.tracking.record import EXPERIMENT, Record, Server, find_records, parent_of, read_record
 from training.tracking.threads import background

@@ -2,9 +2,10 @@
 
 MLflow makes its tables in some dozens of migrations of which none can be taken back, and cannot finish what a kill cut
 short. So a store is made under another name and renamed. It also notes absolute places of artifacts; those are changed
-where the folder lies elsewhere by now.
+where the folder lies elsewhere by now. What MLflow's pages show of this project first is said here, too.
 """
 
+import json
 import logging
 import os
 import re
@@ -15,11 +16,12 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from datagen.common.errors import RecipeError, StorageError, UnsafeFileError
 from datagen.common.files import lock_within, resolve_within
-from training.tracking.record import EXPERIMENT, Server
+from training.tracking.record import EXPERIMENT, MODEL, Server
 
 log = logging.getLogger(__name__)
 _SCHEME = "sqlite:///"
@@ -32,6 +34,17 @@ _PLACES = {
     "model_versions": "storage_location",
 }
 """Table -> its column of absolute places."""
+
+_VIEW = "dsffnet"
+_COLUMNS = ("metrics.`pmd_unseen`", "metrics.`pmd_seen`", "metrics.`millimetres_unseen`", "attributes.`Models`")
+_STATE = {"selectedColumns": _COLUMNS, "columnOrder": [], "columnWidths": {}, "runsExpanded": {}}
+_SAVED_VIEW = {"name": "PMD", "createdAt": 0, "updatedAt": 0, "state": json.dumps(_STATE)}
+
+EXPERIMENT_TAGS = {
+    "mlflow.experimentKind": "custom_model_development",  # training, where MLflow would take it for GenAI
+    f"mlflow.sharedViewState.{_VIEW}": json.dumps(_SAVED_VIEW),  # columns of the list, for the address below
+}
+"""Tags by which MLflow's pages show the experiment as trainings, with columns of PMD."""
 
 
 def sqlite_server(database: Path, *, own: bool = False) -> Server:
@@ -90,6 +103,21 @@ def experiment_in(database: Path) -> str | None:
     with _opened(database) as connection:
         found = connection.execute("SELECT experiment_id FROM experiments WHERE name = ?", [EXPERIMENT]).fetchone()
     return str(found[0]) if found else None
+
+
+def mark_experiment(client: Any, experiment: Any) -> None:
+    """Give an experiment those of its tags that it lacks; what people set stays."""
+    for key, value in EXPERIMENT_TAGS.items():
+        if key not in experiment.tags:
+            client.set_experiment_tag(experiment.experiment_id, key, value)
+
+
+def page_addresses(server: str, experiment: str) -> dict[str, str]:
+    """Return the addresses of the runs' and the model's pages of a server ``http://HOST:PORT``."""
+    return {
+        "runs": f"{server}/#/experiments/{experiment}/runs?workflowType=machine_learning&viewStateShareKey={_VIEW}",
+        "model": f"{server}/#/models/{MODEL}",
+    }
 
 
 def require_inside(place: object, server: Server) -> None:

@@ -11,10 +11,25 @@ from pathlib import Path
 from typing import Any
 
 from datagen.common.files import read_within, resolve_within
-from training.tracking.mlflow_pages import MODEL_DESCRIPTION, how_to_call
 from training.tracking.record import ALIAS
 
 _ROOT = Path(__file__).parents[2]
+_DESCRIPTION = f"""\
+Pose transfer: a source mesh gives the pose, a target mesh the identity. Each version is one training; its description
+says on what data, and its PMD. `{ALIAS}` is the newest.
+
+{{call}}"""
+
+_CALL = """\
+```python
+import mlflow
+model = mlflow.pyfunc.load_model("{uri}")
+posed = model.predict({{"source": source_vertices, "target": target_vertices, "target_faces": target_faces}})
+```
+
+Vertices [n, 3] and [m, 3], triangles [f, 3]; out come the target's vertices [m, 3] in the source's pose. With files:
+`dsffnet transfer --model {uri} --source pose.obj --target person.glb --out posed.glb --tracking-uri URI`
+"""
 _NO_CACHES = shutil.ignore_patterns("__pycache__", "*.pyc", "node_modules")
 
 
@@ -45,7 +60,7 @@ class Registration:
         """Give the registered version, if there is one, its description: what is said of it, how it is called."""
         version = self._registered_version(name)
         if version is not None:
-            text = f"{about}\n\n{how_to_call(f'models:/{name}/{version}')}"
+            text = f"{about}\n\n{_how_to_call(f'models:/{name}/{version}')}"
             self.client.update_model_version(name, version, description=text)
         return version is not None
 
@@ -100,8 +115,8 @@ class Registration:
         from mlflow.exceptions import MlflowException
 
         try:
-            call = how_to_call(f"models:/{name}@{ALIAS}")
-            self.client.create_registered_model(name, description=MODEL_DESCRIPTION.format(call=call))
+            call = _how_to_call(f"models:/{name}@{ALIAS}")
+            self.client.create_registered_model(name, description=_DESCRIPTION.format(call=call))
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
@@ -130,3 +145,8 @@ def _signature() -> Any:
     options = {"up": ("string", "Y"), "front": ("string", "Z"), "align": ("boolean", False), "refine": ("double", 0.0)}
     params = ParamSchema([ParamSpec(name, *kind_and_default) for name, kind_and_default in options.items()])
     return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]), params=params)
+
+
+def _how_to_call(uri: str) -> str:
+    """Markdown that says how a registered model, ``models:/NAME/VERSION`` or ``models:/NAME@ALIAS``, is called."""
+    return _CALL.format(uri=uri)

@@ -15,11 +15,14 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from datagen.common.files import read_json_if_whole, set_aside, write_atomically
+
+if TYPE_CHECKING:
+    from datagen.store import Dataset
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 Milliseconds = Annotated[int, Field(ge=0, lt=253_402_300_800_000)]
@@ -27,6 +30,8 @@ Milliseconds = Annotated[int, Field(ge=0, lt=253_402_300_800_000)]
 FILE = "record.json"
 EXPERIMENT = "dsffnet"
 MODEL, ALIAS = "dsffnet", "latest-trained"
+CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
+"""Attributes that identify a dataset, wherever it lies."""
 
 
 @dataclass(frozen=True)
@@ -201,3 +206,8 @@ def _user() -> str:
 
 def _now() -> int:
     return int(time.time() * 1000)
+
+
+def about_dataset(dataset: "Dataset") -> dict[str, str]:
+    """What a record says of a dataset, wherever that lies: name, URL, and what identifies its content."""
+    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in CONTENT}

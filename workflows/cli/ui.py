@@ -11,8 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datagen.common.errors import DatasetError, DsffnetError
-from training.tracking.mlflow_pages import page_addresses
-from training.tracking.mlflow_store import experiment_in, prepare_store, sqlite_server
+from training.tracking.mlflow_store import experiment_in, page_addresses, prepare_store, sqlite_server
 from workflows.cli.declare import Command, Parser
 
 _LOOK_SECONDS = 0.3

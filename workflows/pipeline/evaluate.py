@@ -12,18 +12,18 @@ from datagen.common.files import read_text_within, write_atomically
 from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import Which
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, read_rows, triples_in, write_rows
-from training.evaluation.paper_numbers import method_name
-from training.evaluation.tables import COLUMNS, about_model, about_weights, mean_of, methods_of, report
+from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_of, report
 from training.inference.predict import load_trained
 from training.inference.projection import PROJECTED, OntoParts
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
-from training.reports.examples import comparisons_of, draw_comparisons, draw_training_curve
-from training.tracking.record import Record, flatten, has_record, read_record, update_record
-from workflows.pipeline.generate import CONTENT, about_dataset
+from training.reports.examples import comparisons_of, draw_comparisons
+from training.reports.plots.training_curve import draw_training_curve
+from training.tracking.record import CONTENT, Record, about_dataset, flatten, has_record, read_record, update_record
 from workflows.pipeline.progress import bar, sampling
 from workflows.pipeline.run_folder import EvaluationFolder, RunFolder
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import about_model
 from workflows.pipeline.weights_argument import Evaluated, evaluated
 
 ARTIFACTS = ["rows.csv", "tables.md", "viewer.html", "figures", "meshes"]
@@ -93,7 +93,7 @@ def _shown(weights: Sequence[Evaluated]) -> dict[str, _Shown]:
     found: dict[str, _Shown] = {}
     for each in weights:
         network, trained, step = load_trained(each.weights)
-        name = method_name(trained.network)
+        name = trained.network.title
         name = f"{name} beside" if name in found else name
         found[name] = _Shown(Method(name, str(each.weights)), network, step, trained)
     return found

@@ -2,24 +2,20 @@
 
 import json
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 from datagen.common.errors import DsffnetError
 from datagen.common.files import write_atomically
 from datagen.generate import generate
 from datagen.grid import Grid
 from datagen.recipe import DatasetRecipe
-from datagen.store import Dataset, ManifestRow, open_dataset
+from datagen.store import ManifestRow, open_dataset
 from datagen.store.verify import describe
 from training.reports.contact_sheet import draw_contact_sheet
-from training.tracking.record import has_record, update_record
+from training.tracking.record import about_dataset, has_record, update_record
 from workflows.pipeline.progress import bar, sampling
 from workflows.pipeline.run_folder import WorkflowFolder
 from workflows.pipeline.stage import Stage, recorded
 from workflows.pipeline.tasks import TaskRunner
-
-CONTENT = ("uuid", "recipe_sha256", "manifest_sha256")
-"""Attributes that identify a dataset, wherever it lies."""
 
 
 def generate_stage(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> Stage:
@@ -55,11 +51,6 @@ def generation_bar(rows: Iterable[ManifestRow], grid: Grid) -> Iterator[Manifest
         for row in rows:
             shown.update(row.rows)
             yield row
-
-
-def about_dataset(dataset: Dataset) -> dict[str, str]:
-    """What identifies a dataset."""
-    return {"name": Path(dataset.url).name, "url": dataset.url} | {key: dataset.attributes[key] for key in CONTENT}
 
 
 def is_complete(data: str) -> bool:

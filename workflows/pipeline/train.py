@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from pydantic import TypeAdapter
@@ -17,15 +17,14 @@ from training.checkpoints.checkpoint import is_finished, load_checkpoint, requir
 from training.data.order import last_step_of, order_of
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
-from training.evaluation.tables import about_model
+from training.evaluation.document import plain
 from training.inference.domain_check import noted, seen_in
-from training.recipes.training import TrainingRecipe
-from training.reports.examples import draw_training_curve
-from training.reports.plots.training_curve import draw_coefficients
+from training.recipes.training import NetworkRecipe, TrainingRecipe
+from training.reports.plots.training_curve import draw_coefficients, draw_training_curve
 from training.tracking.journal import read_journal
 from training.tracking.provenance import write_run_head
-from training.tracking.record import MODEL, update_record
-from workflows.pipeline.generate import about_dataset, is_complete
+from training.tracking.record import MODEL, about_dataset, update_record
+from workflows.pipeline.generate import is_complete
 from workflows.pipeline.progress import following
 from workflows.pipeline.run_folder import RunFolder, WorkflowFolder
 from workflows.pipeline.stage import recorded, say
@@ -113,6 +112,18 @@ def _pmd_at(step: int, run: RunFolder) -> dict[str, float]:
     rows = [row for row in read_journal(run.journal) if row["step"] <= step]
     found = {key: value for row in rows for key, value in row.items() if key.startswith("evaluation/pmd_")}
     return {key.removeprefix("evaluation/pmd_"): value for key, value in found.items()}
+
+
+def about_model(network: NetworkRecipe, step: int, dataset: Dataset, pmd: Mapping[str, float]) -> str:
+    """Weights in two paragraphs of markup: on what they were trained, and their PMD by pose type."""
+    people, poses = len(dataset.identities("training")), len(dataset.grid.poses("seen"))
+    name = plain(PurePosixPath(dataset.url).name)
+    scores = ", ".join(f"{value * 1e4:.2f}e-4 in {pose_type} poses" for pose_type, value in pmd.items())
+    return (
+        f"{plain(network.title)}, step {step:,} of a training on {name}: {dataset.recipe.body.family} "
+        f"bodies, {people:,} identities in {poses:,} poses ({dataset.uuid}).\n\n"
+        f"PMD of new identities: {scores or 'not measured'}."
+    )
 
 
 def _say_where_meshes_were(run: Path) -> None:

@@ -20,7 +20,6 @@ from training.evaluation import evaluate as evaluation
 from training.evaluation import measure as measuring
 from training.evaluation.evaluate import NO_OPS, Method, Row, evaluate, measure_chunk, read_rows, triples_in, write_rows
 from training.evaluation.measure import Contender
-from training.evaluation.paper_numbers import method_name
 from training.evaluation.tables import methods_of
 from training.inference.predict import load_trained, predict
 from training.inference.transfer import PoseTransfer
@@ -265,7 +264,7 @@ def test_data_without_triples_are_refused(tmp_path: Path, run: Path) -> None:
     ],
 )
 def test_networks_have_the_names_of_the_paper(network: NetworkRecipe, name: str) -> None:
-    assert method_name(network) == name
+    assert network.title == name
 
 
 def test_a_run_without_weights(dataset: str, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from training.evaluation.evaluate import NO_OPS, Row
 from training.evaluation.statistics import BOOTSTRAP, interval, mean_and_interval
 from training.evaluation.tables import emphasised, mean_of, report, summary, table_1, table_2, table_3
 from training.evaluation.timing import Inference
+from training.recipes.networks import CORENET3D, DSFFNET, NPT
 
 
 def row(method: str, pose_type: str, triple: int, pmd: float) -> Row:
@@ -139,9 +140,9 @@ def test_the_papers_numbers_keep_the_bound_where_they_are_said_to_and_sizes_fit_
         for its in (scores.seen, scores.unseen):
             assert its.chamfer <= 6 * its.pmd, "CD <= 6 PMD holds of the paper's, as of any"
             assert its.pmd > 0 and scores.seen.pmd < scores.unseen.pmd
-    baselines = [paper.TABLE_1["SMPL"][name] for name in (paper.NPT, paper.CORENET3D)]
+    baselines = [paper.TABLE_1["SMPL"][name] for name in (NPT, CORENET3D)]
     assert all(its.seen.earth_mover * 1e-3 > math.sqrt(3e-4 * its.seen.pmd) for its in baselines)
-    parameters = {paper.NPT: 6_054_941, paper.CORENET3D: 24_461_447, paper.DSFFNET: 9_371_023}
+    parameters = {NPT: 6_054_941, CORENET3D: 24_461_447, DSFFNET: 9_371_023}
     for name, cost in paper.TABLE_2.items():
         assert cost.kilobytes == pytest.approx(parameters[name] * 4 / 1024, rel=2e-3)
 

@@ -9,9 +9,8 @@ from datagen.common.errors import WorkflowError
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
-from training.tracking.record import read_record
+from training.tracking.record import about_dataset, read_record
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
-from workflows.pipeline.generate import about_dataset
 from workflows.pipeline.run_folder import EvaluationFolder, RunFolder
 from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import is_trained, train_model

@@ -15,7 +15,7 @@ from tests.support.recipes import tiny_dataset, tiny_training
 from tests.support.workflows import finished_workflow
 from training.recipes.training import EvaluationRecipe
 from training.reports.report import NAMES
-from training.tracking.record import flatten, read_record, write_record
+from training.tracking.record import about_dataset, flatten, read_record, write_record
 from workflows import full
 from workflows.cli.main import main
 from workflows.pipeline import generate, train
@@ -92,7 +92,7 @@ def evaluated(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     record = read_record(evaluation)
     assert record is not None
     parameters = flatten(EvaluationRecipe().model_dump(mode="json"))
-    about = generate.about_dataset(open_dataset(data))
+    about = about_dataset(open_dataset(data))
     write_record(evaluation, replace(record, dataset=about, parameters=parameters, status="FINISHED"))
     return out
 

@@ -58,6 +58,11 @@ def training_curve(
     return saved(figure, path)
 
 
+def draw_training_curve(run: Path, path: Path, *, baselines: dict[str, float]) -> None:
+    """Loss and evaluation PMD over the steps of a run; ``baselines`` are dashed lines."""
+    training_curve(read_journal(run / "metrics.jsonl"), path, baselines=baselines)
+
+
 def draw_coefficients(run: Path, path: str | os.PathLike[str]) -> Path | None:
     """Draw the adaptive coefficients of a run's FFAdaINs over its steps: a panel a block, a label at each curve's end.
 
