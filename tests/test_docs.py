@@ -4,6 +4,7 @@ A block that cannot run here has a comment before it, ``<!-- not run: REASON -->
 """
 
 import re
+import runpy
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,3 +159,8 @@ def test_example_trains_and_compares_two_splits(tmp_path: Path) -> None:
         f"{name:12}{float(ours):10.2f}{float(unchanged):20.2f}" for name, ours, unchanged in table
     ]
     assert (tmp_path / "four/latest").stat().st_mtime_ns == before, "nothing is trained twice"
+
+
+def test_the_picture_of_the_packages_shows_the_contracts() -> None:
+    drawn = runpy.run_path(str(ROOT / "docs" / "architecture.py"))["picture"]()
+    assert drawn == (ROOT / "docs" / "images" / "architecture.svg").read_text(), "python docs/architecture.py"
