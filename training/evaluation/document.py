@@ -81,9 +81,8 @@ def with_best(
     *,
     columns: Sequence[int],
     group: int | Callable[[Line], Hashable | None] | None = None,
-    highest: bool = False,
 ) -> list[list[Cell]]:
-    """Return a table's lines with the lowest (or highest) number of each of some columns in bold, equal ones alike.
+    """Return a table's lines with the lowest number of each of some columns in bold, equal ones alike.
 
     Cells that hold no number are left alone, as are groups in which all numbers are equal.
 
@@ -100,15 +99,15 @@ def with_best(
         groups.setdefault(key(line), []).append(line)
     for members in (members for name, members in groups.items() if name is not None):
         for column in columns:
-            _mark_best(members, column, max if highest else min)
+            _mark_best(members, column)
     return marked
 
 
-def _mark_best(lines: Sequence[list[Cell]], column: int, better: Callable[[set[float]], float]) -> None:
+def _mark_best(lines: Sequence[list[Cell]], column: int) -> None:
     values = [_value(line[column].text) for line in lines]
     numbers = {value for value in values if value is not None}
     for line, value in zip(lines, values, strict=True):
-        if len(numbers) > 1 and value == better(numbers):
+        if len(numbers) > 1 and value == min(numbers):
             line[column] = replace(line[column], bold=True)
 
 

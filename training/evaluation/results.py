@@ -125,9 +125,6 @@ class Row(Score, Triple, Listed):
     """One method on one evaluation triple. Fields come in the order of a file's columns: the last base's first."""
 
 
-METRICS = tuple(field.name for field in fields(Score))
-
-
 def write_rows(rows: list[Row], path: Path) -> None:
     """Write rows as CSV, at once."""
     write_csv(rows, path, Row)

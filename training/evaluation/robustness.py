@@ -195,9 +195,9 @@ def curve(rows: Sequence[RobustnessRow], method: str, disturbance: str, field: s
     return [Level(amount, *mean_and_interval(found[amount])) for amount in sorted(found)]
 
 
-def no_op(rows: Sequence[RobustnessRow], field: str = "pmd") -> float:
-    """What returning the target unchanged scores."""
-    return mean(getattr(row, field) for row in rows if row.method == NO_OP)
+def no_op(rows: Sequence[RobustnessRow]) -> float:
+    """PMD of returning the target unchanged."""
+    return mean(row.pmd for row in rows if row.method == NO_OP)
 
 
 def doubled(levels: Sequence[Level]) -> float | None:

@@ -12,15 +12,17 @@ from datagen.mesh.parts import part_colors
 from datagen.store import Dataset
 from training.viz.mesh_grid import contact_sheet
 
+_ROWS, _COLUMNS = 6, 8
 
-def draw_contact_sheet(dataset: Dataset, path: Path, *, identities: int = 6, poses: int = 8) -> Path:
+
+def draw_contact_sheet(dataset: Dataset, path: Path) -> Path:
     """Draw some identities (rows) in some poses (columns), spread over both splits, both kinds of poses, and all steps.
 
     The first step is the recipe's own grid, the others are what was appended. Meshes that the dataset does not hold,
     training identities in unseen poses, are named as such. Dressed people are coloured by part.
     """
     grid = dataset.grid
-    rows, columns = chosen(identity_groups(grid), identities), chosen(pose_groups(grid), poses)
+    rows, columns = chosen(identity_groups(grid), _ROWS), chosen(pose_groups(grid), _COLUMNS)
     meshes = [_row(dataset, identity, columns) for identity in rows]
     before = grid.steps[0].training + grid.steps[0].evaluation, grid.steps[0].seen + grid.steps[0].unseen
     labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}" for i in rows]

@@ -10,7 +10,7 @@ import numpy as np
 from training.viz.comparison_panels import SIDE, Columns, ShownRow, Strip, panel_size
 from training.viz.page import Page
 from training.viz.style import INK, QUIET, RULE, method_colors, saved
-from training.viz.transfer_example import Comparison, ErrorScale, best_of, methods_in, placed
+from training.viz.transfer_example import ERROR_UNIT, Comparison, best_of, error_limit, errors_of, methods_in, placed
 
 _HEAD, _TITLE, _UNDER, _FOOT = 100, 46, 30, 112  # pixels: heading, title, metrics, colour bar
 _MEANING = {
@@ -25,7 +25,6 @@ def comparison_figure(
     rows: Sequence[Comparison],
     path: str | os.PathLike[str],
     *,
-    error_scale: ErrorScale | None = None,
     panel: tuple[int, int] | None = None,
     close_ups: bool = False,
 ) -> Path:
@@ -40,8 +39,6 @@ def comparison_figure(
     rows : sequence of Comparison
         A row that lacks one of the methods leaves its panels empty.
     path : path of the PNG to write
-    error_scale : ErrorScale, optional
-        Unit of the colour bar; by default centimetres for vertices in metres.
     panel : (int, int), optional
         Width and height of a panel in pixels; by default 312 wide and as high as the meshes need.
     close_ups : bool
@@ -54,10 +51,9 @@ def comparison_figure(
     """
     if not rows:
         raise ValueError("comparison_figure needs at least one example")
-    scale = error_scale or ErrorScale()
-    solid = [ShownRow(row, placed(row), scale.of(row)) for row in rows]
+    solid = [ShownRow(row, placed(row), errors_of(row)) for row in rows]
     columns = Columns(methods_in(rows), panel or panel_size(solid), any(row.errors for row in solid), close_ups)
-    about = _Errors(scale.unit, scale.resolved(rows), max(row.largest_mean for row in solid))
+    about = _Errors(error_limit(rows), max(row.largest_mean for row in solid))
     drawn = [row.strips(columns, about.limit) for row in solid]
     under = _UNDER if len(columns.methods) > 1 else 0
     heights = [_TITLE + sum(strip.height for strip in strips) + under for strips in drawn]
@@ -73,9 +69,8 @@ def comparison_figure(
 
 @dataclass(frozen=True)
 class _Errors:
-    """The unit of errors, where their colours end, and the largest mean error of a method in a row."""
+    """Where the colours of errors end, and the largest mean error of a method in a row."""
 
-    unit: str
     limit: float
     largest_mean: float
 
@@ -113,7 +108,7 @@ def _draw_bars(page: Page, columns: Columns, middle: float, row: ShownRow, about
     colors, best = method_colors(columns.methods), best_of(row.errors)
     start, reach, step = SIDE + 0.78 * columns.panel[0], 0.9 * columns.panel[0], 42.0
     top = middle - step * len(row.errors) / 2 + 14
-    page.text(start, top - 20, f"mean error of a vertex ({about.unit})", size=6.5, color=QUIET)
+    page.text(start, top - 20, f"mean error of a vertex ({ERROR_UNIT})", size=6.5, color=QUIET)
     for place, (method, errors) in enumerate(row.errors.items()):
         mean, y = float(errors.mean()), top + (place + 0.5) * step
         length, weight = reach * mean / max(about.largest_mean, 1e-12), "bold" if method == best else "normal"
@@ -138,5 +133,5 @@ def _draw_foot(page: Page, columns: Columns, about: _Errors) -> None:
     column = 1 + len(columns.methods) if columns.stacked else len(columns.names) - 1
     page.error_bar(
         columns.left(column) + 18, page.height - 86, columns.panel[0] - 36,
-        limit=about.limit, label=f"per-vertex error ({about.unit})",
+        limit=about.limit, label=f"per-vertex error ({ERROR_UNIT})",
     )  # fmt: skip

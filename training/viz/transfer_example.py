@@ -56,31 +56,7 @@ class Motion:
     rate: float
 
 
-@dataclass(frozen=True)
-class ErrorScale:
-    """How errors are told: `factor` turns the vertices' unit into `unit`; `limit` (in `unit`) ends the colours."""
-
-    unit: str = "cm"
-    factor: float = 100.0
-    limit: float | None = None
-
-    def of(self, comparison: Comparison) -> dict[str, Floats]:
-        """Return each method's errors [v] in `unit`; empty without a truth."""
-        return {name: self.factor * errors for name, errors in vertex_errors(comparison).items()}
-
-    def resolved(self, comparisons: Sequence[Comparison]) -> float:
-        """Return the limit in `unit`, by default the 99th percentile of a method's errors in all rows.
-
-        Of several methods it is the median of their percentiles: one bad method does not make all others look alike.
-        """
-        if self.limit is not None:
-            return self.limit
-        pooled: dict[str, list[Floats]] = {}
-        for comparison in comparisons:
-            for name, errors in self.of(comparison).items():
-                pooled.setdefault(name, []).append(errors)
-        tops = [float(np.percentile(np.concatenate(errors), 99)) for errors in pooled.values()]
-        return max(float(np.median(tops)), 1e-12) if tops else 1.0
+ERROR_UNIT = "cm"
 
 
 def output_of(method: str) -> str:
@@ -91,6 +67,24 @@ def output_of(method: str) -> str:
 def methods_in(comparisons: Sequence[Comparison]) -> list[str]:
     """Return the names of all methods, in the order in which they first come."""
     return list(dict.fromkeys(name for one in comparisons for name in one.outputs))
+
+
+def errors_of(comparison: Comparison) -> dict[str, Floats]:
+    """Return each method's errors [v] in centimetres, of vertices in metres; empty without a truth."""
+    return {name: 100 * errors for name, errors in vertex_errors(comparison).items()}
+
+
+def error_limit(comparisons: Sequence[Comparison]) -> float:
+    """Return where the colours of errors end, in centimetres: the 99th percentile of a method's errors in all rows.
+
+    Of several methods it is the median of their percentiles: one bad method does not make all others look alike.
+    """
+    pooled: dict[str, list[Floats]] = {}
+    for comparison in comparisons:
+        for name, errors in errors_of(comparison).items():
+            pooled.setdefault(name, []).append(errors)
+    tops = [float(np.percentile(np.concatenate(errors), 99)) for errors in pooled.values()]
+    return max(float(np.median(tops)), 1e-12) if tops else 1.0
 
 
 def vertex_errors(comparison: Comparison) -> dict[str, Floats]:

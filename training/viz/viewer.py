@@ -32,9 +32,11 @@ from training.viz.look import Look
 from training.viz.render.lighting import ground_shadow, openness
 from training.viz.style import ERROR_COLORS, ROLE_COLORS, method_colors
 from training.viz.transfer_example import (
+    ERROR_UNIT,
     Comparison,
-    ErrorScale,
     best_of,
+    error_limit,
+    errors_of,
     in_view,
     look_at,
     methods_in,
@@ -56,7 +58,6 @@ def write_viewer(
     path: str | os.PathLike[str],
     *,
     title: str,
-    error_scale: ErrorScale | None = None,
 ) -> Path:
     """Write a page with source, target, outputs, ground truth and errors of every example, to be turned with the mouse.
 
@@ -71,8 +72,6 @@ def write_viewer(
     path : path of the HTML to write
     title : str
         Heading of the page.
-    error_scale : ErrorScale, optional
-        Unit of the errors; by default centimetres for vertices in metres.
 
     Returns
     -------
@@ -86,7 +85,7 @@ def write_viewer(
     """
     if not examples:
         raise ValueError("write_viewer needs at least one example")
-    payload = viewer_payload(examples, error_scale=error_scale or ErrorScale())
+    payload = viewer_payload(examples)
     licence = f"/*\n{_asset('THREE-LICENSE.txt')}*/\n"  # a page is a copy of three.js, so its licence goes along
     page = Template(_asset("viewer.html")).substitute(
         title=html.escape(printable(title)),
@@ -98,35 +97,29 @@ def write_viewer(
     return Path(path)
 
 
-def viewer_payload(examples: Sequence[Comparison], *, error_scale: ErrorScale) -> dict[str, Any]:
+def viewer_payload(examples: Sequence[Comparison]) -> dict[str, Any]:
     """Return what the page is given: meshes standing on the ground, errors, colours and the first views."""
     triangles: dict[str, dict[str, str]] = {}
     looks: dict[str, dict[str, Any]] = {}
     methods = methods_in(examples)
     return {
-        "examples": [_example(example, error_scale, triangles, looks) for example in examples],
+        "examples": [_example(example, triangles, looks) for example in examples],
         "looks": looks,
         "methods": [{"name": name, "color": color} for name, color in method_colors(methods).items()],
         "faces": triangles,
         "colors": dict(ROLE_COLORS),
         "error": {
-            "unit": error_scale.unit,
-            "limit": error_scale.resolved(examples),
+            "unit": ERROR_UNIT,
+            "limit": error_limit(examples),
             "colors": np.rint(255 * ERROR_COLORS).astype(int).tolist(),
         },
     }
 
 
-def decode_positions(mesh: dict[str, Any]) -> Floats:
-    """Return the positions [v, 3] of an embedded mesh, as the page sees them."""
-    levels = np.frombuffer(base64.b64decode(mesh["positions"]), "<u2").reshape(-1, 3)
-    return np.asarray(np.array(mesh["low"]) + levels * np.array(mesh["step"]))
-
-
 def _example(
-    comparison: Comparison, scale: ErrorScale, triangles: dict[str, dict[str, str]], looks: dict[str, dict[str, Any]]
+    comparison: Comparison, triangles: dict[str, dict[str, str]], looks: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
-    meshes, errors = placed(comparison), scale.of(comparison)
+    meshes, errors = placed(comparison), errors_of(comparison)
     originals = comparison.meshes()
     embedded = {
         name: _mesh(mesh, str(getattr(originals[name], "name", "")), triangles)
@@ -142,7 +135,7 @@ def _example(
         "truth": embedded.get("truth"),
         "outputs": {name: embedded[output_of(name)] for name in comparison.outputs},
         "metrics": {name: comparison.metrics.get(name, "") for name in comparison.outputs},
-        "errors": {name: _errors(values, scale.unit) for name, values in errors.items()},
+        "errors": {name: _errors(values) for name, values in errors.items()},
         "best": best_of(errors),
         "view": _view(meshes | boxes),
         "motion": _motion(comparison, frames, triangles),
@@ -175,7 +168,7 @@ def _box(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(np.array(np.meshgrid(*np.stack([low, high], axis=1))).reshape(3, -1).T, np.empty((0, 3), np.int64))
 
 
-def _errors(errors: Floats, unit: str) -> dict[str, Any]:
+def _errors(errors: Floats) -> dict[str, Any]:
     """Return a method's errors [v], and their mean and maximum in words."""
     largest = float(errors.max())
     step = max(largest, 1e-12) / _LEVELS
@@ -183,7 +176,7 @@ def _errors(errors: Floats, unit: str) -> dict[str, Any]:
         "levels": _base64(np.rint(errors / step).astype("<u2")),
         "step": step,
         "mean": float(errors.mean()),
-        "text": f"mean {errors.mean():.3g}, max {largest:.3g} {unit}",
+        "text": f"mean {errors.mean():.3g}, max {largest:.3g} {ERROR_UNIT}",
     }
 
 

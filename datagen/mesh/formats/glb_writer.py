@@ -67,11 +67,10 @@ class GlbParts:
         stored = corners.astype(np.uint16 if small else np.uint32)[:, None]
         return self.accessor(stored, view=self.view(stored.tobytes(), target=_INDICES))
 
-    def positions(self, values: NDArray[np.float32], *, view: int | None = None, offset: int = 0) -> int:
+    def positions(self, values: NDArray[np.float32]) -> int:
         """Add positions [vertex, 3] with the bounds that the specification wants."""
-        place = self.view(values.tobytes(), target=_VERTICES) if view is None else view
         bounds = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self.accessor(values, view=place, offset=offset, **bounds)
+        return self.accessor(values, view=self.view(values.tobytes(), target=_VERTICES), **bounds)
 
 
 @dataclass

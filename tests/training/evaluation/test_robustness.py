@@ -1,6 +1,6 @@
 """Robustness: rows of a disturbed source, what is skipped, what is kept, tables and pictures of them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from tests.support.recipes import tiny_dataset
 from training.data.batch import read_batch
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, score
-from training.evaluation.results import METRICS, kept_rows, write_csv
+from training.evaluation.results import Score, kept_rows, write_csv
 from training.evaluation.robustness import (
     NO_OP,
     Level,
@@ -133,7 +133,7 @@ def test_scores_are_zero_for_the_truth_and_the_earth_mover_is_optional(dataset: 
     (case,) = cases_of(open_dataset(dataset), 1)
     truth = np.asarray(case.truth.vertices - case.truth.vertices.mean(0))
     found = score(truth, truth, case.target.faces, half=1.0, emd_points=8)
-    assert all(getattr(found, name) == pytest.approx(0, abs=1e-9) for name in METRICS)
+    assert all(getattr(found, each.name) == pytest.approx(0, abs=1e-9) for each in fields(Score))
     moved = score(truth + 0.1, truth, case.target.faces, half=2.0)
     assert moved.millimetres == pytest.approx(1000 * 2 * 0.1 * np.sqrt(3)) and np.isnan(moved.earth_mover)
 

@@ -114,9 +114,9 @@ def test_methods_end_at_their_pmd_on_unseen_poses_or_of_training_where_none_was_
     tmp_path: Path, drawn: list[Figure]
 ) -> None:
     runs = {name: run_of(tmp_path / name, level=level) for name, level in (("NPT", 0.04), ("DSFFNet", 0.01))}
-    convergence_figure(runs, "unused.png", baselines={"target unchanged": 0.05})
+    convergence_figure(runs, "unused.png")
     for panel in (0, 1):
-        assert texts(drawn[0], panel) == ["target unchanged", "5  DSFFNet", "20  NPT"]
+        assert texts(drawn[0], panel) == ["5  DSFFNet", "20  NPT"]
         assert sorted(len(np.asarray(line.get_xdata())) for line in drawn[0].axes[panel].get_lines())[-2:] == [40, 40]
     with open(run_of(tmp_path / "short", level=0.01, steps=9) / "metrics.jsonl", "a") as file:
         file.write(json.dumps({"step": 10, "loss/reconstruction": float("nan"), "meshes_per_second": 16.0}) + "\n")
@@ -165,8 +165,8 @@ def only(*keys: str) -> list[dict[str, float]]:
         lambda path: training_curve.training_curve(only("loss/total"), path),
         lambda path: training_curve.training_curve(only("learning_rate", "evaluation/pmd_seen"), path),
         lambda path: sweep_figure([curve("$x_{", 0.0, 0.1, float("inf"), 0.05), curve("b")], path),
-        lambda path: convergence_figure({"ours": run_of(path.parent.parent / "run", level=0.01)}, path, title="$x_{"),
-        lambda path: ablation_figure(rows_of("DSFFNet", 0.002), path, title="$x_{"),
+        lambda path: convergence_figure({"$x_{": run_of(path.parent.parent / "run", level=0.01)}, path),
+        lambda path: ablation_figure(rows_of("DSFFNet", 0.002), path),
     ],
 )
 def test_plots_are_written_whole_and_leave_nothing_else(tmp_path: Path, draw: Callable[[Path], Path]) -> None:

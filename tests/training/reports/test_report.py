@@ -170,7 +170,7 @@ def test_the_best_of_each_group_are_marked_ties_too() -> None:
     ]
     lowest = with_best(lines, columns=[2], group=0)
     assert [line[2].bold for line in lowest[1:]] == [True, False, True, True, False, False, False, False]
-    assert [line[3].text for line in with_best(lines, columns=[3], highest=True) if line[3].bold] == ["7"]
+    assert [line[3].text for line in with_best(lines, columns=[3]) if line[3].bold] == ["1"]
     some = with_best(lines, columns=[2], group=lambda line: None if line[0] == Cell("seen") else "all")
     assert [line[1].text for line in some if line[2].bold] == ["a", "b"], (
         "seen takes no part; the ones of other are least"

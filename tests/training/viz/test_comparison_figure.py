@@ -15,7 +15,7 @@ from training.viz.close_up import CloseUp
 from training.viz.comparison_figure import comparison_figure
 from training.viz.render.camera import Camera
 from training.viz.style import ERROR_COLORS, METHOD_COLORS, error_colors, method_colors
-from training.viz.transfer_example import Comparison, ErrorScale, best_of, camera_of, placed, vertex_errors
+from training.viz.transfer_example import Comparison, best_of, camera_of, error_limit, placed, vertex_errors
 
 PANEL = (120, 140)
 SIDE, HEAD, TITLE = 20, 100, 46
@@ -90,11 +90,9 @@ def test_an_output_that_strays_far_does_not_shrink_the_others() -> None:
 
 def test_the_limit_of_the_error_scale_is_shared_and_one_bad_method_does_not_set_it() -> None:
     rows = [comparison(ours=0.01), comparison(ours=0.05)]
-    assert ErrorScale().resolved(rows) == pytest.approx(5.0)  # centimetres
-    assert ErrorScale(unit="mm", factor=1000).resolved(rows) == pytest.approx(50.0)
-    assert ErrorScale(limit=3.0).resolved(rows) == 3.0
-    assert ErrorScale().resolved([comparison(ours=0.0)]) > 0
-    assert ErrorScale().resolved([comparison(a=0.01, b=0.02, broken=9.0)]) == pytest.approx(2.0)
+    assert error_limit(rows) == pytest.approx(5.0)  # centimetres
+    assert error_limit([comparison(ours=0.0)]) > 0
+    assert error_limit([comparison(a=0.01, b=0.02, broken=9.0)]) == pytest.approx(2.0)
 
 
 def test_methods_keep_their_colours_whoever_stands_beside_them() -> None:

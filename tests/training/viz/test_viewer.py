@@ -11,11 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from datagen.common.arrays import Floats
 from tests.support.reports.pages import Elements
 from training.viz.look import Look, Paint
-from training.viz.transfer_example import Comparison, ErrorScale, Motion, placed
+from training.viz.transfer_example import Comparison, Motion, placed
 from training.viz.transfer_picture import NamedMesh
-from training.viz.viewer import MOTION_LIMIT, decode_positions, frames_apart, viewer_payload, write_viewer
+from training.viz.viewer import MOTION_LIMIT, frames_apart, viewer_payload, write_viewer
+
+
+def decode_positions(mesh: dict[str, Any]) -> Floats:
+    """Return the positions [v, 3] of an embedded mesh, as the page sees them."""
+    levels = np.frombuffer(base64.b64decode(mesh["positions"]), "<u2").reshape(-1, 3)
+    return np.asarray(np.array(mesh["low"]) + levels * np.array(mesh["step"]))
 
 
 def examples(count: int = 2, name: str = "body", methods: tuple[str, ...] = ("DSFFNet",)) -> list[Comparison]:
@@ -79,7 +86,7 @@ def test_triangles_are_exact_and_kept_once(tmp_path: Path) -> None:
 def test_many_vertices_take_wider_indices() -> None:
     vertices = np.random.default_rng(0).normal(size=(65536, 3))
     mesh = NamedMesh(vertices, np.array([[0, 1, 65535]]), "")
-    payload = viewer_payload([Comparison("big", mesh, mesh, {"m": mesh}, mesh)], error_scale=ErrorScale())
+    payload = viewer_payload([Comparison("big", mesh, mesh, {"m": mesh}, mesh)])
     (kept,) = payload["faces"].values()
     indices = np.frombuffer(base64.b64decode(kept["indices"]), "<u4")
     assert kept["kind"] == "uint32" and indices.tolist() == [0, 1, 65535]
@@ -113,7 +120,7 @@ def test_each_example_is_first_seen_whole(tmp_path: Path) -> None:
     small, large = examples(2)
     larger = [NamedMesh(1000 * np.asarray(mesh.vertices), mesh.faces, "") for mesh in (large.source, large.target)]
     lone = replace(large, source=larger[0], target=larger[1], outputs={}, truth=None)
-    views = [one["view"] for one in viewer_payload([small, lone], error_scale=ErrorScale())["examples"]]
+    views = [one["view"] for one in viewer_payload([small, lone])["examples"]]
     assert views[1]["height"] > 100 * views[0]["height"]
     assert all(np.linalg.norm(view["direction"]) == pytest.approx(1) for view in views)
 
@@ -182,9 +189,7 @@ def test_what_faces_look_like_is_kept_once_with_all_of_its_faces() -> None:
     (example,) = examples(1)
     target = painted(NamedMesh(example.target.vertices, example.target.faces, "t"))
     output = replace(target, vertices=np.asarray(target.vertices) + 1)
-    payload = viewer_payload(
-        [replace(example, target=target, outputs={"m": output}, truth=None)], error_scale=ErrorScale()
-    )
+    payload = viewer_payload([replace(example, target=target, outputs={"m": output}, truth=None)])
     (shown,) = payload["examples"]
     assert shown["source"]["look"] is None and shown["target"]["look"] == shown["outputs"]["m"]["look"]
     look = payload["looks"][shown["target"]["look"]]
@@ -210,7 +215,7 @@ def test_a_sequence_is_whole_and_stays_where_it_begins() -> None:
         for step in range(5)
     ]
     first = replace(example, source=frames[0][0], outputs={"m": frames[0][1]}, truth=None, motion=Motion(frames, 12.5))
-    (shown,) = viewer_payload([first], error_scale=ErrorScale())["examples"]
+    (shown,) = viewer_payload([first])["examples"]
     motion = shown["motion"]
     assert motion["rate"] == 12.5 and [frame["name"] for frame in motion["output"]] == ["o0", "o1", "o2", "o3", "o4"]
     stands = placed(first)
@@ -218,7 +223,7 @@ def test_a_sequence_is_whole_and_stays_where_it_begins() -> None:
     for step, (one, other) in enumerate(zip(motion["source"], motion["output"], strict=True)):
         assert np.allclose(decode_positions(one), stands["source"].vertices + scale * step, atol=1e-3)
         assert np.allclose(decode_positions(other), stands["output m"].vertices + step, atol=1e-3)
-    still = viewer_payload([replace(first, motion=None)], error_scale=ErrorScale())["examples"][0]
+    still = viewer_payload([replace(first, motion=None)])["examples"][0]
     assert still["motion"] is None and still["view"]["height"] < shown["view"]["height"], "all frames are in view"
 
 

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.evaluation.statistics import mean_and_interval
+from training.recipes.networks import DSFFNET
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, logarithmic, method_colors, saved, style_axes
 
 _METRICS = (("PMD (1e-4)", "pmd", 1e4), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
@@ -22,23 +23,18 @@ _AXES, _ROW, _TOP, _BOTTOM, _LETTER = 2.55, 0.5, 0.66, 0.34, 0.072  # inches
 def ablation_figure(
     rows: Sequence[Row],
     path: str | os.PathLike[str],
-    *,
-    reference: str = "DSFFNet",
-    title: str = "",
 ) -> Path:
     """Draw PMD, CD and EMD of each method as dots with their 95 % intervals, seen (open) and unseen (filled) poses.
 
-    Each value is written beside its dot, with its ratio to that of the reference on the same poses; the reference's on
+    Each value is written beside its dot, with its ratio to that of the full DSFFNet on the same poses; DSFFNet's on
     unseen poses (seen, where there are no others) is a line through all methods. Scales are logarithmic.
 
     Parameters
     ----------
     rows : sequence of Row
-        One or more triples of each method; methods stand in the order in which they first come.
+        One or more triples of each method; DSFFNet stands first (without it there are no ratios), the others in
+        the order in which they first come.
     path : path of the PNG to write
-    reference : str
-        The method that the others are compared with: the full network. Without rows of it there are no ratios.
-    title : str
 
     Raises
     ------
@@ -48,16 +44,16 @@ def ablation_figure(
     if not rows:
         raise ValueError("ablation_figure needs at least one row")
     methods = list(dict.fromkeys(row.method for row in rows))
-    methods.sort(key=lambda name: name != reference)  # it comes first
-    figure, panels = _page(methods, title)
+    methods.sort(key=lambda name: name != DSFFNET)  # it comes first
+    figure, panels = _page(methods)
     for axes, (label, field, factor) in zip(panels, _METRICS, strict=True):
         found = {kind: _intervals(rows, methods, field, factor, kind) for kind in POSE_TYPES}
-        _draw_panel(axes, methods, {kind: table for kind, table in found.items() if table}, reference)
+        _draw_panel(axes, methods, {kind: table for kind, table in found.items() if table})
         axes.set_title(label, fontsize=8.5, color=INK, weight="bold", loc="left", pad=5)
     for place, method in enumerate(methods):
         panels[0].text(
             -0.04, place, method, transform=panels[0].get_yaxis_transform(), fontsize=8, ha="right", va="center",
-            color=INK, weight="bold" if method == reference else "normal", parse_math=False,
+            color=INK, weight="bold" if method == DSFFNET else "normal", parse_math=False,
         )  # fmt: skip
     _legend(figure)
     return saved(figure, path)
@@ -78,7 +74,7 @@ def _intervals(rows: Sequence[Row], methods: Sequence[str], field: str, factor: 
     return found
 
 
-def _page(methods: Sequence[str], title: str) -> tuple[Figure, list[Axes]]:
+def _page(methods: Sequence[str]) -> tuple[Figure, list[Axes]]:
     names = 0.25 + max(map(len, methods)) * _LETTER
     width, height = names + 3 * (_AXES + 0.95) + 0.1, _TOP + len(methods) * _ROW + _BOTTOM
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAGE)
@@ -87,20 +83,19 @@ def _page(methods: Sequence[str], title: str) -> tuple[Figure, list[Axes]]:
         left = names + place * (_AXES + 0.95)
         box = (left / width, _BOTTOM / height, _AXES / width, len(methods) * _ROW / height)
         panels.append(figure.add_axes(box, sharey=panels[0] if panels else None))
-    figure.text(0.1 / width, 1 - 0.2 / height, title, fontsize=9, weight="bold", color=INK, parse_math=False)
     return figure, panels
 
 
-def _draw_panel(axes: Axes, methods: Sequence[str], tables: dict[str, _Table], reference: str) -> None:
+def _draw_panel(axes: Axes, methods: Sequence[str], tables: dict[str, _Table]) -> None:
     colors = method_colors(methods)
     main = tables.get("unseen") or next(iter(tables.values()))
-    if reference in main:
-        axes.axvline(main[reference][0], color=colors[reference], linewidth=0.8, linestyle=(0, (4, 2.5)), zorder=0)
+    if DSFFNET in main:
+        axes.axvline(main[DSFFNET][0], color=colors[DSFFNET], linewidth=0.8, linestyle=(0, (4, 2.5)), zorder=0)
     for kind, table in tables.items():
         for method, interval in table.items():
             y = methods.index(method) - (_OFFSETS[kind] if len(tables) > 1 else 0)
             _draw_interval(axes, y, interval, color=colors[method], fill=PAGE if kind == "seen" else colors[method])
-            _write_value(axes, y, interval[0], table.get(reference, interval)[0], prominent=table is main)
+            _write_value(axes, y, interval[0], table.get(DSFFNET, interval)[0], prominent=table is main)
     _styled(axes, len(methods))
 
 

@@ -15,7 +15,7 @@ from datagen.common.files import resolve_within
 from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
 from training.recipes.files import recipe_in
 from training.tracking.journal import read_journal
-from training.viz.style import DPI, INK, PAGE, EndLabel, dashed_level, label_ends, method_colors, saved, style_learning
+from training.viz.style import DPI, INK, PAGE, EndLabel, label_ends, method_colors, saved, style_learning
 
 _LEFT, _AXES, _HEIGHT, _TOP, _BOTTOM, _LETTER = 0.62, 3.7, 3.1, 0.52, 0.5, 0.068  # inches
 _LABEL_POINTS = 11.0
@@ -72,9 +72,6 @@ def learning_of(name: str, run: Path) -> Learning:
 def convergence_figure(
     runs: Mapping[str, Path],
     path: str | os.PathLike[str],
-    *,
-    title: str = "",
-    baselines: Mapping[str, float] | None = None,
 ) -> Path:
     """Draw PMD over iterations and over seconds of training: thin of each logged batch, thick of the evaluations.
 
@@ -83,9 +80,6 @@ def convergence_figure(
     runs : dict
         Name of a method -> folder of its run. Names of `METHOD_COLORS` have a fixed colour.
     path : path of the PNG to write
-    title : str
-    baselines : dict, optional
-        Name -> PMD (box^2) on unseen poses of doing nothing, drawn as dashed lines.
 
     Raises
     ------
@@ -98,16 +92,16 @@ def convergence_figure(
     learned = [one for one in learned if len(one.final)]
     if not learned:
         raise ValueError(f"no run has a PMD to draw: {', '.join(map(str, runs.values())) or 'none was given'}")
-    figure, panels = _page(max(len(_label(one)) for one in learned), title)
+    figure, panels = _page(max(len(_label(one)) for one in learned))
     for axes, over in zip(panels, ("steps", "seconds"), strict=True):
-        _draw_panel(axes, learned, over, baselines or {})
+        _draw_panel(axes, learned, over)
     _legend(figure, panels[0], learned)
     for axes, over in zip(panels, ("steps", "seconds"), strict=True):  # the shared limits are known only now
         _name_ends(axes, learned, over)
     return saved(figure, path)
 
 
-def _page(letters: int, title: str) -> tuple[Figure, list[Axes]]:
+def _page(letters: int) -> tuple[Figure, list[Axes]]:
     """Two panels beside each other, each with room for names of so many letters at its right."""
     names = 0.3 + letters * _LETTER
     width, height = _LEFT + 2 * (_AXES + names) + 0.25, _TOP + _HEIGHT + _BOTTOM
@@ -117,18 +111,15 @@ def _page(letters: int, title: str) -> tuple[Figure, list[Axes]]:
     for left in lefts:
         box = (left / width, _BOTTOM / height, _AXES / width, _HEIGHT / height)
         panels.append(figure.add_axes(box, sharey=panels[0] if panels else None))
-    figure.text(_LEFT / width, 1 - 0.18 / height, title, fontsize=9, weight="bold", color=INK, parse_math=False)
     return figure, panels
 
 
-def _draw_panel(axes: Axes, learned: Sequence[Learning], over: str, baselines: Mapping[str, float]) -> None:
+def _draw_panel(axes: Axes, learned: Sequence[Learning], over: str) -> None:
     colors = method_colors([one.name for one in learned])
     for kind, style in _STYLES.items():
         for one in learned:
             curve: RunCurve = getattr(one, kind)
             axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, color=colors[one.name], **style)
-    for name, level in baselines.items():
-        dashed_level(axes, name, level / PMD_UNIT)
     style_learning(axes)
     axes.set_xlabel("iteration" if over == "steps" else "seconds of training", fontsize=8, color=INK, labelpad=2)
     axes.set_ylabel("PMD (1e-4)" if over == "steps" else "", fontsize=8, color=INK, labelpad=2)

@@ -8,6 +8,8 @@ import numpy as np
 
 from datagen.common.arrays import Floats, Integers
 
+_ELEVATION = 12.0
+
 
 class MeshLike(Protocol):
     """Anything with ``vertices`` [v, 3] (float) and ``faces`` [f, 3] (int)."""
@@ -47,7 +49,6 @@ def frame(
     *,
     size: tuple[int, int] = (320, 400),
     azimuth: float | None = None,
-    elevation: float = 12.0,
     margin: float = 0.09,
 ) -> Camera:
     """Return the three-quarter camera that just holds all meshes, so that panels drawn with it can be compared.
@@ -58,14 +59,14 @@ def frame(
         Meshes with vertices [v, 3], Y up, facing +Z.
     size : (int, int)
         Width and height of the panel in pixels.
-    azimuth, elevation : float
-        Direction of the eye in degrees: from +Z towards +X, and above the horizon. By default 28 from the front for
+    azimuth : float
+        Direction of the eye in degrees from +Z towards +X, 12 above the horizon. By default 28 from the front for
         upright bodies, and 62 for bodies that are long from front to back, as most animals.
     margin : float
         Share of the panel left free on each side.
     """
     points = np.concatenate([checked_vertices(mesh.vertices) for mesh in meshes])
-    turn, rise = np.radians([azimuth_of(meshes) if azimuth is None else azimuth, elevation])
+    turn, rise = np.radians([azimuth_of(meshes) if azimuth is None else azimuth, _ELEVATION])
     direction = np.array([np.sin(turn) * np.cos(rise), np.sin(rise), np.cos(turn) * np.cos(rise)])
     axes = axes_of(direction)
     in_view = points @ axes.T

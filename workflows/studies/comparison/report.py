@@ -17,7 +17,6 @@ from workflows.studies.comparison.plan import ComparisonPlan
 from workflows.studies.comparison.tables import tables_of
 from workflows.studies.sweep.plan import Trial
 
-REPORT = "report.md"
 _FIGURES = (
     ("convergence.png", "PMD over steps and seconds: thin in training, thick on new identities (paper, Figure 4)."),
     ("ablation.png", "What each variant loses against the whole network (paper, Table 3)."),
