@@ -94,20 +94,12 @@ def _make_weights(folder: Path, specimens: Specimens) -> None:
 
 def _make_workflow(folder: Path, specimens: Specimens) -> None:
     """A workflow's folder: records, marks of its stages, what was sent to MLflow, journals, rows, a figure."""
+    from tests.support.workflows import recorded_workflow
     from training.evaluation.results import Row, write_rows
-    from training.tracking.journal import Journal
     from training.tracking.mirror_state import note_sent
-    from training.tracking.record import begin_record, end_record, update_record
+    from training.tracking.record import end_record, update_record
 
-    root = folder / "workflow"
-    begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
-    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
-    journal = Journal(root / "run" / "metrics.jsonl")
-    for step in range(1, 6):
-        journal.write(step, {"loss/total": 1 / step, "learning_rate": 0.1})
-    journal.close()
-    (root / "run" / "figures").mkdir()
-    (root / "run" / "figures" / "curve.png").write_bytes(b"png")
+    root = recorded_workflow(folder / "workflow")
     write_rows([Row("DSFFNet", "seen", 3, 1, 2, 3, 4, *[0.5] * 8)] * 3, root / "run" / "rows.csv")
     about_data = {"name": "leg.zarr", "url": "leg.zarr", "manifest_sha256": "0" * 64}
     update_record(root / "run", artifacts=["figures", "rows.csv"], metrics={"final": 0.5}, dataset=about_data)

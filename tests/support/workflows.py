@@ -17,6 +17,7 @@ from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row, write_rows
 from training.evaluation.tables import report
 from training.networks import network_from
 from training.reports.plots.training_curve import draw_training_curve
+from training.tracking.journal import Journal
 from training.tracking.record import begin_record, end_record, update_record
 
 
@@ -62,3 +63,17 @@ def finished_workflow(pristine: Path, out: Path) -> list[Row]:
     (out / "stages" / "train.json").write_text(json.dumps(mark))
     update_record(out, status="RUNNING")
     return rows
+
+
+def recorded_workflow(root: Path) -> Path:
+    """A workflow's folder: a parent's record, and that of its training with five rows of a journal and a figure."""
+    begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
+    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
+    journal = Journal(root / "run" / "metrics.jsonl")
+    for step in range(1, 6):
+        journal.write(step, {"loss/total": 1 / step, "learning_rate": 0.1})
+    journal.close()
+    (root / "run" / "figures").mkdir()
+    (root / "run" / "figures" / "curve.png").write_bytes(b"png")
+    update_record(root / "run", artifacts=["figures"], metrics={"final": 0.5})
+    return root

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from datagen.common.errors import TrackingError
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_training
+from tests.support.workflows import recorded_workflow
 from training.engine.trainer import train
 from training.inference.domain_check import seen_by
 from training.inference.registered_model import download_weights
@@ -50,23 +52,20 @@ def server(empty_store: Path, tmp_path: Path) -> Server:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A workflow's folder with a parent record, a child, metrics and an artifact."""
-    root = tmp_path / "workflow"
-    begin_record(root, name="quick", kind="workflow", parent=None, parameters={"training.batch": "8"})
-    begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
-    journal = Journal(root / "run" / "metrics.jsonl")
-    for step in range(1, 6):
-        journal.write(step, {"loss/total": 1 / step, "learning_rate": 0.1})
-    journal.close()
-    (root / "run" / "figures").mkdir()
-    (root / "run" / "figures" / "curve.png").write_bytes(b"png")
-    update_record(root / "run", artifacts=["figures"], metrics={"final": 0.5})
-    return root
+    return recorded_workflow(tmp_path / "workflow")
 
 
 def runs_of(server: Server) -> dict[str, Any]:
+    """The runs by name, of which no two have the same."""
     client = mlflow.MlflowClient(server.uri)
-    experiment = client.get_experiment_by_name(EXPERIMENT)
-    return {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+    found = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
+    runs = {run.info.run_name: run for run in found}
+    assert len(runs) == len(found), "a run was made twice"
+    return runs
+
+
+def ids_of(server: Server) -> dict[str, str]:
+    return {name: run.info.run_id for name, run in runs_of(server).items()}
 
 
 def history(server: Server, run: Any, key: str) -> list[tuple[int, float]]:
@@ -212,12 +211,10 @@ def test_an_unreadable_note_is_set_aside_and_nothing_is_sent_twice(
     root: Path, server: Server, note: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     publish(root, server)
-    before = {name: run.info.run_id for name, run in runs_of(server).items()}
+    before = ids_of(server)
     (root / "run" / "mlflow.json").write_bytes(note)
     publish(root, server)
-    client = mlflow.MlflowClient(server.uri)
-    found = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
-    assert {run.info.run_name: run.info.run_id for run in found} == before and len(found) == 2
+    assert ids_of(server) == before and len(before) == 2
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
     assert (root / "run" / "mlflow.json.unreadable").read_bytes() == note
     assert sum("mlflow.json is unreadable" in line for line in caplog.messages) == 1
@@ -232,12 +229,41 @@ def test_an_unreadable_record_of_one_stage_keeps_back_no_other(root: Path, serve
     assert set(runs_of(server)) == {"quick", "train"}
 
 
-def test_repeating_changes_nothing(root: Path, server: Server) -> None:
-    for _ in range(3):
+def forget(folder: Path, server: Server, *keys: str) -> None:
+    """As if a kill had come between a call to the server and the note about it."""
+    state = json.loads((folder / "mlflow.json").read_text())
+    for key in keys:
+        state[server.uri].pop(key)
+    state[server.uri].setdefault("offsets", {})
+    (folder / "mlflow.json").write_text(json.dumps(state))
+
+
+def as_if_a_kill_had_come_before(*keys: str) -> Callable[[Path, Server], None]:
+    return lambda root, server: forget(root / "run", server, *keys)
+
+
+def deleted(root: Path, server: Server) -> None:
+    mlflow.MlflowClient(server.uri).delete_run(runs_of(server)["train"].info.run_id)
+
+
+@pytest.mark.parametrize(
+    "between",
+    [lambda *_: None, as_if_a_kill_had_come_before("offsets"), as_if_a_kill_had_come_before("metrics"), deleted],
+    ids=["nothing", "the note of rows is lost", "the note of metrics is lost", "the run is deleted on the server"],
+)
+def test_whatever_happens_between_two_sendings_every_point_is_there_once(
+    root: Path, server: Server, between: Callable[[Path, Server], None]
+) -> None:
+    publish(root, server)
+    between(root, server)
+    for _ in range(2):
         publish(root, server)
     child = runs_of(server)["train"]
     assert len(runs_of(server)) == 2
     assert len(history(server, child, "loss/total")) == 5 and len(history(server, child, "final")) == 1
+    update_record(root / "run", metrics={"final": 0.25})
+    publish(root, server)
+    assert runs_of(server)["train"].data.metrics["final"] == 0.25, "a later value wins"
 
 
 def test_going_on_appends_to_the_same_run(root: Path, server: Server) -> None:
@@ -250,17 +276,6 @@ def test_going_on_appends_to_the_same_run(root: Path, server: Server) -> None:
     publish(root, server)
     child = runs_of(server)["train"]
     assert [step for step, _ in history(server, child, "loss/total")] == [1, 2, 3, 4, 5, 6]
-
-
-def test_killed_between_sending_and_noting(root: Path, server: Server) -> None:
-    """The note of what was sent is lost; sending it all again leaves every point once."""
-    publish(root, server)
-    note = root / "run" / "mlflow.json"
-    state = json.loads(note.read_text())
-    state[server.uri]["offsets"] = {}
-    note.write_text(json.dumps(state))
-    publish(root, server)
-    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
 
 
 def test_an_outage_is_one_error_and_made_up_for_later(
@@ -338,32 +353,15 @@ def test_another_server_gets_runs_of_its_own(root: Path, server: Server, empty_s
     assert len(runs_of(second)) == 2 == len(runs_of(server))
 
 
-def test_a_run_deleted_on_the_server_is_made_again(root: Path, server: Server) -> None:
-    publish(root, server)
-    mlflow.MlflowClient(server.uri).delete_run(runs_of(server)["train"].info.run_id)
-    publish(root, server)
-    assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
-
-
-def forget(folder: Path, server: Server, *keys: str) -> None:
-    """As if a kill had come between a call to the server and the note about it."""
-    state = json.loads((folder / "mlflow.json").read_text())
-    for key in keys:
-        state[server.uri].pop(key)
-    (folder / "mlflow.json").write_text(json.dumps(state))
-
-
 def test_a_run_that_a_kill_kept_from_being_noted_is_adopted(root: Path, server: Server) -> None:
     publish(root, server)
-    before = {name: run.info.run_id for name, run in runs_of(server).items()}
+    before = ids_of(server)
     for folder in (root, root / "run"):
         (folder / "mlflow.json").unlink()
     begin_record(root / "run", name="train", kind="train", parent=root, parameters={"batch": "8"})
     update_record(root / "run", metrics={"final": 0.5}, parameters={"batch": "9"})
     publish(root, server)
-    client = mlflow.MlflowClient(server.uri)
-    found = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
-    assert {run.info.run_name: run.info.run_id for run in found} == before and len(found) == 2
+    assert ids_of(server) == before and len(before) == 2
     child = runs_of(server)["train"]
     assert len(history(server, child, "loss/total")) == 5
     assert child.data.params == {"batch": "8"} and child.data.tags["changed.batch"] == "9"
@@ -380,19 +378,8 @@ def test_a_create_request_that_the_client_repeated_leaves_one_run(
 
     monkeypatch.setattr(mlflow.MlflowClient, "create_run", twice)
     publish(root, server)
-    client = mlflow.MlflowClient(server.uri)
-    assert len(client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])) == 2
+    assert len(runs_of(server)) == 2
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
-
-
-def test_summary_metrics_sent_twice_are_one_point_and_a_later_value_wins(root: Path, server: Server) -> None:
-    publish(root, server)
-    forget(root / "run", server, "metrics")
-    publish(root, server)
-    assert len(history(server, runs_of(server)["train"], "final")) == 1
-    update_record(root / "run", metrics={"final": 0.25})
-    publish(root, server)
-    assert runs_of(server)["train"].data.metrics["final"] == 0.25
 
 
 def test_what_the_server_refuses_of_one_record_does_not_keep_back_the_others(
@@ -427,8 +414,7 @@ def test_a_journal_put_back_from_an_older_copy_is_sent_from_its_beginning(root: 
 def test_two_processes_that_publish_at_once_make_one_run(root: Path, server: Server) -> None:
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda _: publish(root, server), range(4)))
-    client = mlflow.MlflowClient(server.uri)
-    assert len(client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])) == 2
+    assert len(runs_of(server)) == 2
     assert len(history(server, runs_of(server)["train"], "loss/total")) == 5
 
 
