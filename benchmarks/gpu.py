@@ -5,7 +5,7 @@ graph; then forward and training step of whole batches, in float32, TF32 and bfl
 torch.compile. Beside each time: the ratio to the literal float32 form, the memory at the peak less what was held before
 (weights, inputs, the optimiser's state), the share of the measured matrix rate, and how far the result is off the
 literal float32 form's: the largest difference of any output coordinate, the relative one of the whole gradient. What
-fails is said in its place and the rest goes on; the exit status is then 1.
+fails is said in its place and the rest is measured; the exit status is then 1.
 
 Needs torch and NumPy alone, so that it runs on a bare GPU machine. ``--device cpu --vertices 200 --batches 2 --narrow``
 tries it anywhere.

@@ -27,7 +27,7 @@ ExportLayout = Literal["npt-obj", "npt-ply", "obj", "ply", "glb", "glb-animated"
 _POSES_A_SECOND = 2.0  # of an animation: most datasets' poses are drawn one by one, and are no motion
 Cell = tuple[int, int]
 """An identity and a pose."""
-Progress = Callable[[Sequence[Cell]], Iterable[Cell]]
+CellProgress = Callable[[Sequence[Cell]], Iterable[Cell]]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def export_dataset(
     poses: Iterable[int] | None = None,
     prefix: str = "",
     fresh: bool = False,
-    progress: Progress = iter,
+    progress: CellProgress = iter,
 ) -> int:
     """Write the meshes of a dataset as files and return how many were written.
 
@@ -106,7 +106,7 @@ def export_dataset(
     except (StorageError, PermissionError) as error:
         raise StorageError(
             f"{error}. What is there is whole: make room or choose another folder (--out), and run the same command "
-            "again to go on"
+            "again to resume"
         ) from error
 
 

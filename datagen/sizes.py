@@ -102,7 +102,7 @@ def require_disk(size: DatasetSize, url: str) -> None:
     if size.disk - there > free:
         raise StorageError(
             f"{url} will take about {bytes_text(size.disk)}, but its disk has {bytes_text(free)} left. Make room, "
-            "choose another --out, lower data.identities or data.poses, or go on all the same with --yes"
+            "choose another --out, lower data.identities or data.poses, or continue all the same with --yes"
         )
 
 

@@ -103,13 +103,13 @@ class ImportedModel:
         if len(mesh.vertices) != len(first.vertices):
             raise BodyError(
                 f"{path} has {len(mesh.vertices)} vertices, the identity's first file {len(first.vertices)}. "
-                "All poses of an identity share vertices and faces: mend the file, or leave out its pose or identity: "
-                f"{_CHOOSE}"
+                "All poses of an identity share vertices and faces: repair the file, or leave out its pose or "
+                f"identity: {_CHOOSE}"
             )
         if not np.array_equal(mesh.faces, first.faces):
             raise BodyError(
                 f"{path} has other faces than the identity's first file. All poses of an identity share vertices and "
-                f"faces: mend the file, or leave out its pose or identity: {_CHOOSE}"
+                f"faces: repair the file, or leave out its pose or identity: {_CHOOSE}"
             )
         return mesh
 
@@ -122,7 +122,7 @@ def _load(path: Path) -> Mesh:
     try:
         return load_mesh(path)
     except MeshError as error:
-        raise MeshError(f"{error}. Mend the file, or leave out its pose or identity: {_CHOOSE}") from error
+        raise MeshError(f"{error}. Repair the file, or leave out its pose or identity: {_CHOOSE}") from error
 
 
 def frame(up: Axis, forward: Axis) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -145,7 +145,7 @@ def _digest(meshes: FoundMeshes) -> str:
             content = sha256_of(path, limit=BYTE_LIMIT)
         except OSError as error:
             raise BodyError(
-                f"{path} cannot be read ({error.strerror}). Mend its permissions or take it away"
+                f"{path} cannot be read ({error.strerror}). Correct its permissions or take it away"
             ) from error
         digest.update(f"{cell[0]}\0{cell[1]}\0{content}\n".encode())
     return digest.hexdigest()

@@ -108,7 +108,7 @@ class CheckpointError(DsffnetError):
 
 
 class TrainingError(DsffnetError):
-    """Training cannot go on: non-finite loss, too few CPUs, another process on the same run.
+    """Training cannot continue: non-finite loss, too few CPUs, another process on the same run.
 
     ``secondary`` marks what a rank says only because another rank failed.
     """

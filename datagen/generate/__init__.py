@@ -27,8 +27,8 @@ from datagen.store.verify import Fault, find_faults
 from datagen.store.writer import committed_hashes, finish
 
 __all__ = [
-    "Progress",
     "Runner",
+    "ShardProgress",
     "Task",
     "append",
     "ensure_shard",
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
-Progress = Callable[[Iterator[ManifestRow], Grid], Iterable[ManifestRow]]
+ShardProgress = Callable[[Iterator[ManifestRow], Grid], Iterable[ManifestRow]]
 
 
 def generate(
@@ -50,7 +50,7 @@ def generate(
     url: str,
     *,
     run: Runner = inline,
-    progress: Progress = lambda rows, grid: rows,
+    progress: ShardProgress = lambda rows, grid: rows,
     fresh: bool = False,
 ) -> Dataset:
     """Make the dataset at ``url``, or what is missing of it; a complete one is returned as it is.
@@ -96,11 +96,11 @@ def append(
     unseen: int | None = None,
     recipe: DatasetRecipe | None = None,
     run: Runner = inline,
-    progress: Progress = lambda rows, grid: rows,
+    progress: ShardProgress = lambda rows, grid: rows,
 ) -> Dataset:
     """Give an existing dataset more identities or poses, up to these totals; no shard that is there is touched.
 
-    The totals make it repeatable: the same call again goes on after an interruption, and does nothing when done.
+    The totals make it repeatable: the same call again resumes after an interruption, and does nothing when done.
     The result is, byte for byte, what the grown recipe makes from nothing. ``recipe`` is the dataset's own, with other
     paths where asset files have moved. A store without a lock (S3) is to be appended to from one place at a time.
 
@@ -177,7 +177,7 @@ def _make_missing(
     recipe: DatasetRecipe,
     url: str,
     run: Runner,
-    progress: Progress,
+    progress: ShardProgress,
     *,
     growing: bool = False,
     lost: Sequence[str] = (),
@@ -194,7 +194,7 @@ def repair(
     faults: list[Fault],
     *,
     run: Runner = inline,
-    progress: Progress = lambda rows, grid: rows,
+    progress: ShardProgress = lambda rows, grid: rows,
 ) -> Dataset:
     """Make the faulty shards and other objects again and check that the dataset is whole; the rest is not touched."""
     with writing_alone(url):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datagen.bodies import BodyModel, load_body, part_labels, require_joints
 from datagen.common.seeding import Stream, generator
-from datagen.generate.rigs import RigTable
+from datagen.generate.rigs import RigCollection
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
@@ -45,7 +45,7 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
     poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
     parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
     topologies = _Topologies(recipe, body)
-    table, numbers, rig_numbers = RigTable(), [], []
+    table, numbers, rig_numbers = RigCollection(), [], []
     for identity, its in enumerate(parameters):  # all of a person at once, who may be dear to make
         numbers.append(topologies.number_of(identity, its))
         rig_numbers.append(table.add(body.rig(its, source.joints)))

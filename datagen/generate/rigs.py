@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from datagen.mesh.rig import Rig, Rigs
 
 
-class RigTable:
+class RigCollection:
     """The rigs of identities, which are added one after another, numbered as they appear."""
 
     def __init__(self) -> None:

@@ -45,7 +45,7 @@ def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
     except ray.exceptions.RayError as error:
         raise ClusterError(
             f"Ray gave up on a task ({type(error).__name__}: {str(error).splitlines()[0]}). "
-            "Run the same command again to go on from here"
+            "Run the same command again to resume"
         ) from error
     finally:
         for reference in running:

@@ -28,7 +28,7 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 Words = Sequence[tuple[str, Any]]
 """Dotted keys and the values that they get, in order."""
-Kind = tuple[str, str, Any]
+Variant = tuple[str, str, Any]
 """A section of which there are several kinds, the key that says which, and which it is where that key is missing."""
 
 
@@ -63,7 +63,7 @@ def parse_words(words: Iterable[str], *, option: str = "") -> Words:
     words
         As a person writes them.
     option
-        Named in errors, with a space behind it, e.g. ``"--set "``.
+        Named in errors, with a space after it, e.g. ``"--set "``.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def parse_words(words: Iterable[str], *, option: str = "") -> Words:
     return [_parse_word(word, option) for word in words]
 
 
-def changed(values: dict[str, Any], words: Words, *, kinds: Sequence[Kind] = ()) -> dict[str, Any]:
+def changed(values: dict[str, Any], words: Words, *, kinds: Sequence[Variant] = ()) -> dict[str, Any]:
     """Return nested values with the values of dotted keys set in them, mappings merged into mappings.
 
     A section of another kind than before keeps none of its other keys: they would not fit it.

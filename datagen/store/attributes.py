@@ -108,7 +108,7 @@ def _is_tree(joints: list[str], parents: list[Any]) -> bool:
 def check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:
     fault = attributes_fault(group)
     if fault:
-        raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
+        raise DatasetError(f"{url}: {fault}. Repair it: dsffnet verify {url} --repair")
     stored = attributes_of(group)["body"]["assets"]
     if _identities(stored) == _identities(present):
         return
@@ -129,7 +129,7 @@ def _named(assets: set[tuple[str, str]]) -> str:
 
 
 def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> None:
-    """Refuse to go on with a dataset that another recipe (or version) began; the message names what differs."""
+    """Refuse to resume a dataset that another recipe (or version) began; the message names what differs."""
     check_version(url, group)
     if attributes_of(group).get("recipe_sha256") == recipe.sha256():
         return
@@ -138,7 +138,7 @@ def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> Non
     if not changed:
         raise DatasetError(
             f"{url}: the recipe in its attributes is not the one that it was made by. Run the command that made it "
-            "again, with that recipe, and it is mended"
+            "again, with that recipe, and it is repaired"
         )
     raise DatasetError(
         f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"

@@ -72,7 +72,7 @@ class ShardCodec:
         return np.add.outer(np.arange(identities) * self.poses, np.arange(poses)).ravel()
 
     def encode(self, meshes: NDArray[np.float32]) -> bytes:
-        """The file that holds meshes [identity, pose, vertex, 3]; the cells behind them are left empty."""
+        """The file that holds meshes [identity, pose, vertex, 3]; the cells after them are left empty."""
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
         flat = np.ascontiguousarray(meshes, "<f4").reshape(-1, self.vertices, 3)
         chunks = [_sealed(bytes(compressor.encode(mesh))) for mesh in flat]

@@ -1,4 +1,4 @@
-"""Reading a dataset: only a complete and sound one; anything else is an error that names the mending command."""
+"""Reading a dataset: only a complete and sound one; anything else is an error that names the command to repair it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -210,7 +210,7 @@ class Dataset:
         Raises
         ------
         DatasetError
-            A shard is missing or damaged; the message names it and the command that mends it.
+            A shard is missing or damaged; the message names it and the command that repairs it.
         KeyError
             The identity was not made in such a pose.
         """
@@ -284,7 +284,7 @@ class Dataset:
 
     @property
     def _mend(self) -> str:
-        return f"Mend it: dsffnet verify {self.url} --repair"
+        return f"Repair it: dsffnet verify {self.url} --repair"
 
 
 def damage_of(read: Callable[[], Any]) -> ArrayDamage | None:
@@ -320,7 +320,7 @@ def open_dataset(url: str) -> Dataset:
     faults = list(islice(_quick_faults(dataset), 1000))
     if faults:
         more = f" and {len(faults) - 1} more" if len(faults) > 1 else ""
-        raise DatasetError(f"{url}: {faults[0]}{more}. Mend it: dsffnet verify {url} --repair")
+        raise DatasetError(f"{url}: {faults[0]}{more}. Repair it: dsffnet verify {url} --repair")
     return dataset
 
 

@@ -140,7 +140,7 @@ class RemoteObjects(FsspecStore):
     def _unanswered(self, error: Exception) -> StorageError:
         return StorageError(
             f"{self.url} cannot be reached ({reason_of(error)}). Check its address and your credentials (for S3: "
-            "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL), then run the same command again: it goes on "
+            "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL), then run the same command again: it resumes "
             "from what is there"
         )
 

@@ -31,11 +31,11 @@ class Fault:
     shard: bool = False
 
 
-Progress = Callable[[Iterable[Fault | None], int], Iterable[Fault | None]]
+FaultProgress = Callable[[Iterable[Fault | None], int], Iterable[Fault | None]]
 """Wraps the results of shards, of which there are so many."""
 
 
-def find_faults(url: str, *, progress: Progress = lambda shards, total: shards) -> Iterator[Fault]:
+def find_faults(url: str, *, progress: FaultProgress = lambda shards, total: shards) -> Iterator[Fault]:
     """Check everything: each shard of the dataset's grid, then every other object, by the hashes of the manifest.
 
     Where a dataset is still being made there is no manifest; its shards are decoded instead.
@@ -122,7 +122,7 @@ def describe(url: str) -> dict[str, Any]:
     check_version(url, group)
     fault = attributes_fault(group)
     if fault:
-        raise DatasetError(f"{url}: {fault}. Mend it: dsffnet verify {url} --repair")
+        raise DatasetError(f"{url}: {fault}. Repair it: dsffnet verify {url} --repair")
     attributes, recipe = attributes_of(group), stored_recipe(url, group)
     dataset = Dataset(url, group)
     grid, arrays = Grid(recipe), _arrays(dataset)

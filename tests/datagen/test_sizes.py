@@ -130,7 +130,7 @@ def test_the_disk_counts_what_is_there_already(spoilable: Path, monkeypatch: pyt
     size, there = size_of(tiny_dataset()), sum(p.stat().st_size for p in spoilable.rglob("*") if p.is_file())
     monkeypatch.setattr(sizes, "free_disk", lambda folder: int(size.disk - there) + 1)
     require_disk(size, str(spoilable))
-    with pytest.raises(StorageError, match=r"its disk has .* left. Make room, .* or go on all the same with --yes"):
+    with pytest.raises(StorageError, match=r"its disk has .* left. Make room, .* or continue all the same with --yes"):
         require_disk(size, str(spoilable.parent / "none.zarr"))
 
 

@@ -62,7 +62,7 @@ def test_the_status_is_the_job_s(head: Stack) -> None:
     driver = at_work(process)
     process.send_signal(signal.SIGINT)
     status, output = end(process)
-    assert status == 130 and "the job goes on" in output.splitlines()[-1]
+    assert status == 130 and "the job continues" in output.splitlines()[-1]
     assert driver.is_running()
 
 

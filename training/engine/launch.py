@@ -117,7 +117,7 @@ def fit_while_progressing(fit: Callable[[], object], run: Path) -> None:
         except Exception as error:
             if (run / _FAILURE).exists() or (run / STOP_FILE).exists() or _newest(run) == before:
                 raise
-            words = "the training ranks died %d times, at last of: %s; going on, as there is progress"
+            words = "the training ranks died %d times, at last of: %s; resuming, as there is progress"
             log.warning(words, _RESTARTS + 1, _last_line(error))
 
 

@@ -42,8 +42,8 @@ __all__ = [
     "write_rows",
 ]
 
-Runner = Callable[[Callable[..., Any], list[tuple[Any, ...]]], Iterator[Any]]
-Progress = Callable[[Iterable[list[Row]], int, int], Iterable[list[Row]]]
+ChunkRunner = Callable[[Callable[..., Any], list[tuple[Any, ...]]], Iterator[Any]]
+EvaluationProgress = Callable[[Iterable[list[Row]], int, int], Iterable[list[Row]]]
 """Passes on rows as they come; told the triples of the whole evaluation, and those that were kept from before."""
 
 _DISTANCE = 2 * 8
@@ -57,9 +57,9 @@ def evaluate(
     data: str,
     recipe: EvaluationRecipe,
     *,
-    tasks: Runner,
+    tasks: ChunkRunner,
     keep: Path | None = None,
-    progress: Progress = lambda rows, total, done: rows,
+    progress: EvaluationProgress = lambda rows, total, done: rows,
 ) -> list[Row]:
     """Measure methods and the no-op baselines on a dataset's fixed evaluation triples; rows come in a fixed order.
 
@@ -77,7 +77,7 @@ def evaluate(
         Folder for finished pieces, one small CSV a method and chunk: the same call again measures only what is missing,
         and one with another method added only that method. Pieces of other weights, data or recipes are removed.
     progress
-        See :data:`Progress`; :func:`triples_in` counts what comes.
+        See :data:`EvaluationProgress`; :func:`triples_in` counts what comes.
 
     Raises
     ------

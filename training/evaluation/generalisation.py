@@ -21,7 +21,7 @@ from training.evaluation.statistics import mean
 
 
 @dataclass(frozen=True)
-class Kind:
+class MeshKind:
     """Meshes of one kind.
 
     Attributes
@@ -82,24 +82,24 @@ class GeneralisationRow(Score, Counts, Triple, Between):
     """One method on one triple from a kind of source to a kind of target."""
 
 
-def have_truth(source: Kind, target: Kind) -> bool:
+def have_truth(source: MeshKind, target: MeshKind) -> bool:
     """Whether the ground truth of transfers from one kind to the other is known."""
     return source.poses == target.poses
 
 
-def pairs_with_truth(kinds: Sequence[Kind]) -> list[tuple[Kind, Kind]]:
+def pairs_with_truth(kinds: Sequence[MeshKind]) -> list[tuple[MeshKind, MeshKind]]:
     """All (source, target) whose ground truth is known, sources in order."""
     return [(source, target) for source in kinds for target in kinds if have_truth(source, target)]
 
 
-def cases_between(source: Kind, target: Kind, count: int) -> list[Case]:
+def cases_between(source: MeshKind, target: MeshKind, count: int) -> list[Case]:
     """The first triples of the source's list, with target and truth in the target's mesh."""
     triples = source.triples(count).tolist()
     return [case_of(source.dataset, place, triple, target.dataset) for place, triple in enumerate(triples)]
 
 
 def measured(
-    methods: Sequence[LoadedMethod], kinds: Sequence[Kind], *, triples: int, done: Sequence[GeneralisationRow] = ()
+    methods: Sequence[LoadedMethod], kinds: Sequence[MeshKind], *, triples: int, done: Sequence[GeneralisationRow] = ()
 ) -> Iterator[list[GeneralisationRow]]:
     """Rows of every pair of kinds that has a truth, a list a pair: every method that ``done`` lacks.
 

@@ -22,7 +22,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Page:
+class EmbeddedPage:
     """A page of its own, such as the viewer: linked, and in the HTML shown in a frame. The caption is markup."""
 
     path: Path
@@ -44,7 +44,7 @@ class Facts:
     facts: Mapping[str, str | int | float | Code]
 
 
-Block = Text | Table | Picture | Page | Facts | Code
+Block = Text | Table | Picture | EmbeddedPage | Facts | Code
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from training.evaluation.document import Table, Text, markdown, plain_markdown, table_markdown
-from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, link_to
+from training.reports.blocks import Block, Code, EmbeddedPage, Facts, Picture, Section, link_to
 from training.reports.markup import inline_text
 
 
@@ -32,7 +32,7 @@ def _block(block: Block, folder: Path) -> str:
         case Picture():
             drawn = f"![{_words(block.caption) or plain_markdown(block.path.stem)}]({link_to(block.path, folder).url})"
             return _joined(drawn, markdown(block.caption))
-        case Page():
+        case EmbeddedPage():
             link = link_to(block.path, folder)
             opened = f"[{plain_markdown(link.path)}]({link.url}), to be opened in a browser."
             return f"{opened} {markdown(block.caption)}".strip()

@@ -18,7 +18,7 @@ from training.evaluation.evaluate import NO_OPS, Row, read_rows
 from training.evaluation.tables import about_weights, mean_of, methods_of, results
 from training.inference.projection import PROJECTED
 from training.recipes.training import EvaluationRecipe
-from training.reports.blocks import Block, Code, Facts, Page, Picture, Section, shown
+from training.reports.blocks import Block, Code, EmbeddedPage, Facts, Picture, Section, shown
 from training.reports.card_texts import NETWORKS, span, vertex_counts
 from training.reports.cards import dataset_card, model_card
 from training.reports.html import report_html
@@ -32,8 +32,8 @@ __all__ = [
     "Block",
     "Cell",
     "Code",
+    "EmbeddedPage",
     "Facts",
-    "Page",
     "Picture",
     "ReportError",
     "Section",
@@ -186,10 +186,10 @@ def _marked(table: Table) -> Table:
     return replace(table, lines=lines, notes="The best of each column and group of poses in bold.")
 
 
-def _viewer(evaluation: Path) -> tuple[Page, ...]:
+def _viewer(evaluation: Path) -> tuple[EmbeddedPage, ...]:
     path = evaluation / "viewer.html"
     words = "The same examples, to be turned with the mouse: drag to turn, wheel or pinch to zoom."
-    return (Page(path, words),) if path.is_file() else ()
+    return (EmbeddedPage(path, words),) if path.is_file() else ()
 
 
 def _curves(run: Path) -> tuple[Picture, ...]:

@@ -86,10 +86,10 @@ def declare_convert(made: Parser) -> None:
 
 
 def declare_stand_in(made: Parser) -> None:
-    from datagen.bodies.standins.smpl_format import Kind
+    from datagen.bodies.standins.smpl_format import StandInKind
     from datagen.recipe import AnnyTopology
 
-    made.add_argument("kind", choices=get_args(Kind), help="whose layout")
+    made.add_argument("kind", choices=get_args(StandInKind), help="whose layout")
     made.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
     made.add_argument(
         "--topology",
@@ -194,7 +194,7 @@ def verify_command(options: argparse.Namespace) -> None:
         return
     if not options.repair:
         found = f"has {len(faults)} faults" if faults else "is not complete"
-        raise DatasetError(f"{options.dataset} {found}. Mend it: dsffnet verify {options.dataset} --repair")
+        raise DatasetError(f"{options.dataset} {found}. Repair it: dsffnet verify {options.dataset} --repair")
     repair(options.dataset, recipe, faults, run=inline, progress=generation_bar)
     print_text(f"{options.dataset} is whole again")
 

@@ -26,10 +26,10 @@ from workflows.pipeline.console import print_text, server_of
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
     from workflows.pipeline.run_folder import TrialsFolder
-    from workflows.studies.sweep.report import Result
+    from workflows.studies.sweep.report import TrialResult
 
-Kind = Literal["comparison", "ablation"]
-_NAMES: dict[Kind, str] = {"comparison": "compare", "ablation": "ablation"}
+ComparisonKind = Literal["comparison", "ablation"]
+_NAMES: dict[ComparisonKind, str] = {"comparison": "compare", "ablation": "ablation"}
 
 
 def _trials_options(made: Parser, one: str) -> None:
@@ -84,7 +84,7 @@ def _ablation_options(made: Parser) -> None:
     _comparison_options(made, "ablation")
 
 
-def _comparison_options(made: Parser, kind: Kind) -> None:
+def _comparison_options(made: Parser, kind: ComparisonKind) -> None:
     from workflows.studies.comparison.plan import known_comparisons
 
     add, names = made.add_argument, ", ".join(known_comparisons(kind))
@@ -113,7 +113,7 @@ def ablation_command(options: argparse.Namespace) -> None:
     _compare(options, "ablation")
 
 
-def _compare(options: argparse.Namespace, kind: Kind) -> None:
+def _compare(options: argparse.Namespace, kind: ComparisonKind) -> None:
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.studies.comparison.plan import plan_comparison
     from workflows.studies.comparison.run import folder_of, run_comparison
@@ -126,7 +126,7 @@ def _compare(options: argparse.Namespace, kind: Kind) -> None:
         print_text(_comparison_words(out, server))
 
 
-def _command_line(options: argparse.Namespace, kind: Kind) -> str:
+def _command_line(options: argparse.Namespace, kind: ComparisonKind) -> str:
     """The command that does the same again."""
     words = ["dsffnet", _NAMES[kind], "--recipe", options.recipe]
     words += ["--set", *options.set] if options.set else []
@@ -191,8 +191,8 @@ def sweep_command(options: argparse.Namespace) -> None:
         run_sweep(sweep, out, settings, show=lambda results: print_text(_sweep_words(results, out, server)))
 
 
-def _sweep_words(results: "list[Result]", out: Path, server: Server) -> str:
-    """The table, where everything lies, and how to go on with the best trial."""
+def _sweep_words(results: "list[TrialResult]", out: Path, server: Server) -> str:
+    """The table, where everything lies, and how to continue from the best trial."""
     from workflows.studies.sweep.report import best_of
 
     figure = {"figure": "figures/sweep.png"} if (out / "figures" / "sweep.png").exists() else {}
@@ -205,7 +205,7 @@ def _sweep_words(results: "list[Result]", out: Path, server: Server) -> str:
         )
         words += [
             "",
-            f"Go on with the best, {best.trial.name}",
+            f"Continue from the best, {best.trial.name}",
             f"  python workflows/full.py --recipe {recipe} --out runs/best",
             f"  dsffnet evaluate {run} --data {data} --recipe {recipe}",
         ]

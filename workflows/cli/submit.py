@@ -45,7 +45,7 @@ def submit_command(options: argparse.Namespace) -> None:
         _follow_with_log(job)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(
-            f"the job goes on. Its log: ray job logs --follow {job.name}; its status: ray job status {job.name}; "
+            f"the job continues. Its log: ray job logs --follow {job.name}; its status: ray job status {job.name}; "
             f"its end: ray job stop {job.name}"
         ) from interrupt
     print(f"job {job.name} succeeded")

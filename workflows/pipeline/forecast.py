@@ -26,7 +26,7 @@ def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, loc
     anew
         It is made though a complete one is there: that one goes, or grows.
     yes
-        Go on though the disk has no room for it.
+        Continue though the disk has no room for it.
     local
         It is made in this process, by one task at a time.
 

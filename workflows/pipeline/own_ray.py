@@ -202,7 +202,7 @@ class _LastWords:
     _SCRIPT = 'while read -r line; do last=$line; done; [ -z "$last" ] || echo "$last" >&2'
 
     def __enter__(self) -> None:
-        self._beside = subprocess.Popen(["sh", "-c", self._SCRIPT], stdin=subprocess.PIPE, text=True)
+        self._beside = subprocess.Popen(["sh", "-c", self._SCRIPT], stdin=subprocess.PIPE, encoding="utf-8")
         self.be(f"error: {_ENDED}")
 
     def be(self, line: str) -> None:

@@ -29,7 +29,7 @@ class Evaluated:
 
     @property
     def weights(self) -> Path:
-        """The one checkpoint's folder or file, which stays the same while training goes on."""
+        """The one checkpoint's folder or file, which stays the same while training continues."""
         return self.checkpoint.path
 
     def folder(self, dataset: "Dataset") -> Path:

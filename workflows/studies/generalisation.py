@@ -9,7 +9,7 @@ from datagen.recipe.base import LARGEST
 from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.generalisation import (
     GeneralisationRow,
-    Kind,
+    MeshKind,
     cases_between,
     grid_table,
     have_truth,
@@ -135,7 +135,7 @@ def _base(options: argparse.Namespace, weights: Sequence[Evaluated]) -> DatasetR
     return own or load_recipe(_FIRST_RECIPE).data
 
 
-def _named_apart(kinds: Sequence[Kind]) -> Sequence[Kind]:
+def _named_apart(kinds: Sequence[MeshKind]) -> Sequence[MeshKind]:
     names = [kind.name for kind in kinds]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -143,13 +143,13 @@ def _named_apart(kinds: Sequence[Kind]) -> Sequence[Kind]:
     return kinds
 
 
-def _trained(weights: Evaluated, kinds: Sequence[Kind]) -> str:
+def _trained(weights: Evaluated, kinds: Sequence[MeshKind]) -> str:
     """The kind that weights were trained on, empty where it is none of these or not known."""
     own = own_recipe(weights.home)
     return own_kind(own, kinds) if own else ""
 
 
-def examples(kinds: Sequence[Kind], trained: str) -> list[Shown]:
+def examples(kinds: Sequence[MeshKind], trained: str) -> list[Shown]:
     """Transfers to draw: to and from every other kind in turn, and, where truth lies in a kind alone, within it."""
     own = next(kind for kind in kinds if kind.name == trained)
     found = []
@@ -162,7 +162,7 @@ def examples(kinds: Sequence[Kind], trained: str) -> list[Shown]:
     return found or [_shown(own, own)]
 
 
-def _shown(source: Kind, target: Kind) -> Shown:
+def _shown(source: MeshKind, target: MeshKind) -> Shown:
     label = f"{_in_lines(source.name)}\nto\n{_in_lines(target.name)}"
     if have_truth(source, target):
         return Shown(label, cases_between(source, target, 1)[0])

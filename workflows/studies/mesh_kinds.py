@@ -21,7 +21,7 @@ from datagen.recipe import (
     SmplBody,
 )
 from datagen.store import Dataset, open_dataset
-from training.evaluation.generalisation import Kind
+from training.evaluation.generalisation import MeshKind
 from training.tracking.provenance import provenance_of
 from workflows.studies.sizes import Other, Sizes
 
@@ -90,7 +90,7 @@ def make_kinds(
     sizes: Sizes,
     *,
     say: Callable[[str], None],
-) -> list[Kind]:
+) -> list[MeshKind]:
     """Make what is missing of the kinds' datasets below a folder.
 
     What cannot be had (animals without a network) is said and left out.
@@ -104,27 +104,27 @@ def make_kinds(
     return made
 
 
-def _standin(base: DatasetRecipe, folder: Path, sizes: Sizes) -> Kind:
+def _standin(base: DatasetRecipe, folder: Path, sizes: Sizes) -> MeshKind:
     model = folder / "smpl-standin.npz"
     if not model.exists():
         write_standin("smpl", model)
     return _kind(standin_recipe(base, model, sizes), folder / "smpl-standin.zarr")
 
 
-def _animals(folder: Path, sizes: Sizes) -> Kind:
+def _animals(folder: Path, sizes: Sizes) -> MeshKind:
     return _kind(animals_recipe(sizes), folder / "animals.zarr")
 
 
-def _kind(recipe: DatasetRecipe, url: Path) -> Kind:
+def _kind(recipe: DatasetRecipe, url: Path) -> MeshKind:
     dataset = generate(recipe, str(url.absolute()))
-    return Kind(kind_name(dataset), dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
+    return MeshKind(kind_name(dataset), dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
 
 
-def imported_kind(url: str) -> Kind:
+def imported_kind(url: str) -> MeshKind:
     """A dataset of a person's own: its poses are its alone."""
     dataset = open_dataset(url)
     name = printable(Path(url).name.removesuffix(".zarr"))
-    return Kind(f"{name} {_counts(dataset)}", dataset, dataset.uuid)
+    return MeshKind(f"{name} {_counts(dataset)}", dataset, dataset.uuid)
 
 
 def kind_name(dataset: Dataset) -> str:
@@ -132,7 +132,7 @@ def kind_name(dataset: Dataset) -> str:
     return f"{_family(dataset.recipe)} {_counts(dataset)}"
 
 
-def own_kind(recipe: DatasetRecipe, kinds: Sequence[Kind]) -> str:
+def own_kind(recipe: DatasetRecipe, kinds: Sequence[MeshKind]) -> str:
     """The name of the kind that has the body of a training's recipe; empty where none has."""
     for kind in kinds:
         body = kind.dataset.recipe.body

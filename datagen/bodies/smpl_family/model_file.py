@@ -90,7 +90,7 @@ def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]
     _, kind = member_header(archive, f"{key}.npy")
     content = io.BytesIO(member_bytes(archive, f"{key}.npy"))
     if kind.hasobject:
-        array_header(content)  # the pickle is behind it
+        array_header(content)  # the pickle comes after it
         return array_of(unpickle(content, name=f"{key!r} in {path}"), name=f"{key!r} in {path}")
     content.seek(0)
     return np.lib.format.read_array(content, allow_pickle=False)

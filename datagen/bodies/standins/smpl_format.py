@@ -27,7 +27,7 @@ from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges
 
-Kind = Literal["smpl", "smplh", "smplx", "smal"]
+StandInKind = Literal["smpl", "smplh", "smplx", "smal"]
 
 _PEOPLE, _SHAPES, _EXPRESSIONS = 200, 10, 10
 _ADULTS = PhenotypeRanges(
@@ -53,7 +53,7 @@ _LIMBS = {
 }  # fmt: skip
 
 
-def write_standin(kind: Kind, out: Path, *, topology: AnnyTopology = "notoes_collapse10pc") -> Path:
+def write_standin(kind: StandInKind, out: Path, *, topology: AnnyTopology = "notoes_collapse10pc") -> Path:
     """Write the stand-in of a model as an .npz in SMPL's layout; the same arguments give the same bytes.
 
     Parameters
@@ -78,7 +78,7 @@ def write_standin(kind: Kind, out: Path, *, topology: AnnyTopology = "notoes_col
     return out
 
 
-def standin(kind: Kind, *, topology: AnnyTopology = "notoes_collapse10pc") -> dict[str, NDArray[Any]]:
+def standin(kind: StandInKind, *, topology: AnnyTopology = "notoes_collapse10pc") -> dict[str, NDArray[Any]]:
     """The arrays of a stand-in (see :mod:`datagen.bodies.smpl_family.model_file`), in the axes of the model that it
     stands for.
 
@@ -87,12 +87,12 @@ def standin(kind: Kind, *, topology: AnnyTopology = "notoes_collapse10pc") -> di
     BodyError
         Unknown kind.
     """
-    if kind not in get_args(Kind):
-        raise BodyError(f"there is no stand-in of {kind!r}; there are {', '.join(get_args(Kind))}")
+    if kind not in get_args(StandInKind):
+        raise BodyError(f"there is no stand-in of {kind!r}; there are {', '.join(get_args(StandInKind))}")
     return _animal() if kind == "smal" else _person(kind, topology)
 
 
-def _person(kind: Kind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
+def _person(kind: StandInKind, topology: AnnyTopology) -> dict[str, NDArray[Any]]:
     body = AnnyModel(AnnyBody(topology=topology, rig="mixamo", phenotypes=_ADULTS))
     people = [body.t_pose(_identity(body, number)) for number in range(_PEOPLE)]
     vertices, heads = (np.stack(parts) for parts in zip(*people, strict=True))

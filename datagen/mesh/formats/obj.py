@@ -1,7 +1,7 @@
 """OBJ files: the text is kept, and only positions and normals in it are written anew.
 
 So materials, groups, smoothing groups, quads, vertex colours, comments and the order of everything stay as they are.
-Lines that go on in the next are joined; names may be of any 8-bit encoding. Free-form surfaces are kept, not posed.
+Continued lines are joined; names may be of any 8-bit encoding. Free-form surfaces are kept, not posed.
 
 Data sets of pose transfer are tens of thousands of files of bare vertices and triangles: those are read whole by NumPy,
 line by line only what is not so regular.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.mesh.formats.mtl import NamedFiles, texture_beside
-from datagen.mesh.formats.ply_header import ORDERS, Table, read_header, read_tables
+from datagen.mesh.formats.ply_header import ORDERS, ElementValues, read_header, read_tables
 from datagen.mesh.formats.surface import Encoded, Format, Image, Material, Surface, numbered, one_mesh, shared_normals
 
 _COLOURS = ("red", "green", "blue", "alpha")
@@ -106,7 +106,7 @@ class PlyContent:
         write = self._text if self._header.form == "ascii" else self._binary
         return Encoded(write(self._tables["vertex"], columns))
 
-    def _binary(self, table: Table, columns: dict[str, NDArray[np.float64]]) -> bytes:
+    def _binary(self, table: ElementValues, columns: dict[str, NDArray[np.float64]]) -> bytes:
         element = next(each for each in self._header.elements if each.name == "vertex")
         kind = np.dtype([(each.name, ORDERS[self._header.form] + each.kind) for each in element.properties])
         values = np.frombuffer(self._content, kind, element.count, table.start).copy()
@@ -114,7 +114,7 @@ class PlyContent:
             values[name] = column
         return self._content[: table.start] + values.tobytes() + self._content[table.end :]
 
-    def _text(self, table: Table, columns: dict[str, NDArray[np.float64]]) -> bytes:
+    def _text(self, table: ElementValues, columns: dict[str, NDArray[np.float64]]) -> bytes:
         place = {name: number for number, name in enumerate(self._vertex)}
         words = [row.split() for row in self._rows[table.start : table.end]]
         for name, column in columns.items():

@@ -82,7 +82,7 @@ def _property(words: list[str]) -> Property:
 
 
 @dataclass(frozen=True)
-class Table:
+class ElementValues:
     """Values of an element's properties: ``single`` [element] each, ``lists`` as values [value] and lengths [element].
 
     ``start`` and ``end`` are where it lies: bytes of a binary file, rows of a text.
@@ -94,9 +94,9 @@ class Table:
     end: int
 
 
-def read_tables(content: bytes, header: Header, rows: list[bytes]) -> dict[str, Table]:
+def read_tables(content: bytes, header: Header, rows: list[bytes]) -> dict[str, ElementValues]:
     """Return the table of each element; ``rows`` are the lines of a text that follow its header."""
-    tables: dict[str, Table] = {}
+    tables: dict[str, ElementValues] = {}
     at = 0 if rows else header.end
     for element in header.elements:
         if header.form == "ascii":
@@ -107,7 +107,7 @@ def read_tables(content: bytes, header: Header, rows: list[bytes]) -> dict[str, 
     return tables
 
 
-def _text_table(element: Element, rows: list[bytes], at: int) -> Table:
+def _text_table(element: Element, rows: list[bytes], at: int) -> ElementValues:
     end = at + element.count
     if end > len(rows):
         raise ValueError(f"it ends before its {element.count:,} elements {element.name!r} do")
@@ -118,10 +118,10 @@ def _text_table(element: Element, rows: list[bytes], at: int) -> Table:
     if any(len(row) < columns for row in words):
         raise ValueError(f"a row of {element.name!r} has fewer than {columns} numbers")
     values = numbers([word for row in words for word in row[:columns]]).reshape(-1, columns)
-    return Table({each.name: values[:, number] for number, each in enumerate(element.properties)}, {}, at, end)
+    return ElementValues({each.name: values[:, number] for number, each in enumerate(element.properties)}, {}, at, end)
 
 
-def _text_lists(element: Element, rows: list[list[bytes]], at: int) -> Table:
+def _text_lists(element: Element, rows: list[list[bytes]], at: int) -> ElementValues:
     found: dict[str, list[list[bytes]]] = {each.name: [] for each in element.properties}
     for row in rows:
         place = 0
@@ -139,21 +139,25 @@ def _floats(values: list[list[bytes]]) -> tuple[NDArray[Any], NDArray[np.int64]]
     return numbers(flat), np.array([len(v) for v in values], np.int64)
 
 
-def _table(element: Element, found: dict[str, tuple[NDArray[Any], NDArray[np.int64]]], at: int, end: int) -> Table:
+def _table(
+    element: Element, found: dict[str, tuple[NDArray[Any], NDArray[np.int64]]], at: int, end: int
+) -> ElementValues:
     listed = {each.name for each in element.properties if each.counted}
     single = {name: values for name, (values, _) in found.items() if name not in listed}
-    return Table(single, {name: found[name] for name in found if name in listed}, at, end)
+    return ElementValues(single, {name: found[name] for name in found if name in listed}, at, end)
 
 
-def _binary_table(content: bytes, element: Element, order: str, at: int) -> Table:
+def _binary_table(content: bytes, element: Element, order: str, at: int) -> ElementValues:
     if not any(each.counted for each in element.properties):
         kind = np.dtype([(each.name, order + each.kind) for each in element.properties])
         values = np.frombuffer(content, kind, element.count, at) if element.count else np.empty(0, kind)
-        return Table({name: values[name] for name in kind.names or ()}, {}, at, at + element.count * kind.itemsize)
+        return ElementValues(
+            {name: values[name] for name in kind.names or ()}, {}, at, at + element.count * kind.itemsize
+        )
     return _equal_lists(content, element, order, at) or _lists(content, element, order, at)
 
 
-def _equal_lists(content: bytes, element: Element, order: str, at: int) -> Table | None:
+def _equal_lists(content: bytes, element: Element, order: str, at: int) -> ElementValues | None:
     """The table where all lists of a property are as long as the first, as of triangles; else None."""
     if not element.count:
         return None
@@ -178,7 +182,7 @@ def _equal_lists(content: bytes, element: Element, order: str, at: int) -> Table
     return _table(element, found, at, at + element.count * kind.itemsize)
 
 
-def _lists(content: bytes, element: Element, order: str, at: int) -> Table:
+def _lists(content: bytes, element: Element, order: str, at: int) -> ElementValues:
     found: dict[str, list[NDArray[Any]]] = {each.name: [] for each in element.properties}
     kinds = [
         (each, np.dtype(order + (each.counted or "u1")), np.dtype(order + each.kind)) for each in element.properties

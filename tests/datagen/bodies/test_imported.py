@@ -122,7 +122,7 @@ def test_missing_broken_and_loose_files_are_named(tmp_path: Path) -> None:
     (folder / "id1_2.ply").write_bytes(b"ply\nnot really")
     with pytest.raises(BodyError, match=r"no file id1_1\.ply \(identity 1, pose 1\)"):
         read(body_of(folder), 1, range(3))
-    with pytest.raises(MeshError, match=r"id1_2\.ply.*Mend the file, or leave out .*data\.body\.identities=\["):
+    with pytest.raises(MeshError, match=r"id1_2\.ply.*Repair the file, or leave out .*data\.body\.identities=\["):
         read(body_of(folder), 1, range(2, 3))
     (tmp_path / "loose").mkdir()
     (tmp_path / "loose" / "0_0.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 5 5 5\nf 1 2 3\n")

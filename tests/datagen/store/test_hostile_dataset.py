@@ -1,5 +1,5 @@
 """A dataset that somebody made to do harm: one clear line, nothing outside touched, memory bounded, and what can be
-mended is mended."""
+repaired is repaired."""
 
 import contextlib
 import errno
@@ -216,7 +216,7 @@ def test_names_that_no_object_has_are_refused_and_nothing_is_touched(
     assert tree_hash(spoilable) == before
 
 
-MENDED = [
+REPAIRED = [
     # names
     pytest.param(numbers("grid/topology", 7), id="a topology that is not there"),
     pytest.param(numbers("grid/topology", -1), id="topology -1"),
@@ -287,8 +287,8 @@ MENDED = [
 ]
 
 
-@pytest.mark.parametrize("attack", MENDED)
-def test_what_can_be_mended_is_one_line_that_names_the_mending(
+@pytest.mark.parametrize("attack", REPAIRED)
+def test_what_can_be_repaired_is_one_line_that_names_the_repair(
     dataset: str, spoilable: Path, victim: Path, capsys: pytest.CaptureFixture[str], attack: Attack
 ) -> None:
     attack(spoilable)
@@ -314,7 +314,7 @@ def test_what_can_be_mended_is_one_line_that_names_the_mending(
         pytest.param(numbers("grid/evaluation/0/pose", 5), id="other numbers of poses, sealed"),
     ],
 )
-def test_what_only_others_read_is_mended_too(
+def test_what_only_others_read_is_repaired_too(
     dataset: str, spoilable: Path, victim: Path, capsys: pytest.CaptureFixture[str], attack: Attack
 ) -> None:
     """Metadata of groups and the numbers along the axes are for other programs; this one knows them."""

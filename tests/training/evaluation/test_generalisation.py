@@ -14,7 +14,7 @@ from tests.support.recipes import tiny_dataset
 from training.evaluation.generalisation import (
     NO_OP,
     GeneralisationRow,
-    Kind,
+    MeshKind,
     cases_between,
     grid_of,
     grid_table,
@@ -28,7 +28,7 @@ from training.networks import build_network
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 
 
-def leg(folder: Path, rings: int, **poses: int) -> Kind:
+def leg(folder: Path, rings: int, **poses: int) -> MeshKind:
     recipe = tiny_dataset(
         body={"family": "leg", "rings": rings, "segments": 4},
         identities={"training": 0, "evaluation": 3},
@@ -36,11 +36,11 @@ def leg(folder: Path, rings: int, **poses: int) -> Kind:
         triples={"count": 4},
     )
     data = generate(recipe, str(folder / f"{rings}-{len(poses)}.zarr"))
-    return Kind(f"leg {4 * rings}{' other' * len(poses)}", data, recipe.poses.model_dump_json())
+    return MeshKind(f"leg {4 * rings}{' other' * len(poses)}", data, recipe.poses.model_dump_json())
 
 
 @pytest.fixture(scope="module")
-def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[Kind]:
+def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[MeshKind]:
     folder = tmp_path_factory.mktemp("kinds")
     return [leg(folder, 8), leg(folder, 12), leg(folder, 6, seed=9)]
 
@@ -54,17 +54,17 @@ def method() -> LoadedMethod:
 
 
 @pytest.fixture(scope="module")
-def rows(kinds: list[Kind], method: LoadedMethod) -> list[GeneralisationRow]:
+def rows(kinds: list[MeshKind], method: LoadedMethod) -> list[GeneralisationRow]:
     return [row for some in measured([method], kinds, triples=4) for row in some]
 
 
-def test_truth_is_known_between_kinds_of_the_same_poses_only(kinds: list[Kind]) -> None:
+def test_truth_is_known_between_kinds_of_the_same_poses_only(kinds: list[MeshKind]) -> None:
     one, two, other = kinds
     assert have_truth(one, two) and not have_truth(one, other)
     assert pairs_with_truth(kinds) == [(one, one), (one, two), (two, one), (two, two), (other, other)]
 
 
-def test_the_truth_is_the_target_in_its_own_mesh_in_the_sources_pose(kinds: list[Kind]) -> None:
+def test_the_truth_is_the_target_in_its_own_mesh_in_the_sources_pose(kinds: list[MeshKind]) -> None:
     one, two, _ = kinds
     for case in cases_between(one, two, 4):
         source, source_pose, target, target_pose = case.triple
@@ -75,7 +75,7 @@ def test_the_truth_is_the_target_in_its_own_mesh_in_the_sources_pose(kinds: list
         assert (len(case.source.vertices), len(case.truth.vertices)) == (32, 48)
 
 
-def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[Kind], rows: list[GeneralisationRow]) -> None:
+def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[MeshKind], rows: list[GeneralisationRow]) -> None:
     names = [kind.name for kind in kinds]
     assert len(rows) == 4 * (5 + 3), "five pairs, and the no-op within each of three kinds"
     assert {(row.source_vertices, row.target_vertices) for row in rows if row.source_kind != row.target_kind} == {
@@ -91,7 +91,7 @@ def test_rows_and_grid_cover_every_pair_with_a_truth(kinds: list[Kind], rows: li
 
 
 def test_what_is_there_is_not_measured_again(
-    kinds: list[Kind], method: LoadedMethod, rows: list[GeneralisationRow], tmp_path: Path
+    kinds: list[MeshKind], method: LoadedMethod, rows: list[GeneralisationRow], tmp_path: Path
 ) -> None:
     write_csv(rows, tmp_path / "rows.csv", GeneralisationRow)
     again = [
@@ -102,7 +102,7 @@ def test_what_is_there_is_not_measured_again(
     assert again == []
 
 
-def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[Kind], method: LoadedMethod) -> None:
+def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[MeshKind], method: LoadedMethod) -> None:
     equal = replace(method, equal_counts="it pairs vertices")
     found = [row for some in measured([equal], kinds[:2], triples=2) for row in some if row.method != NO_OP]
     assert found and all(row.source_vertices == row.target_vertices for row in found)
@@ -111,11 +111,11 @@ def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[Kind], meth
 def test_a_kind_without_triples_is_refused(tmp_path: Path) -> None:
     data = generate(tiny_dataset(identities={"training": 2, "evaluation": 1}), str(tmp_path / "one.zarr"))
     with pytest.raises(DatasetError, match="no evaluation triples"):
-        Kind("one", data, "").triples(3)
+        MeshKind("one", data, "").triples(3)
 
 
 def test_heat_map_and_picture_are_drawn(
-    tmp_path: Path, kinds: list[Kind], method: LoadedMethod, rows: list[GeneralisationRow]
+    tmp_path: Path, kinds: list[MeshKind], method: LoadedMethod, rows: list[GeneralisationRow]
 ) -> None:
     names = [kind.name for kind in kinds]
     with Image.open(heat_map(rows, names, tmp_path / "heat.png", title="tiny", trained=[names[1]])) as picture:

@@ -17,8 +17,8 @@ from training.reports.markup import markup_html
 from training.reports.report import (
     Cell,
     Code,
+    EmbeddedPage,
     Facts,
-    Page,
     Picture,
     ReportError,
     Section,
@@ -59,7 +59,7 @@ def written(folder: Path, *blocks: object, title: str = "A title", lead: str = "
 def test_the_page_holds_its_pictures_and_loads_nothing(tmp_path: Path) -> None:
     picture, page = png(tmp_path / "deep/a curve.png"), tmp_path / "deep/viewer.html"
     page.write_text("<p>turn me</p>")
-    reader, _ = written(tmp_path, Picture(picture, "The **curve**"), Page(page, "To be turned"))
+    reader, _ = written(tmp_path, Picture(picture, "The **curve**"), EmbeddedPage(page, "To be turned"))
     (image,) = reader.all("img")
     kind, content = (image["src"] or "").split(",")
     assert kind == "data:image/png;base64" and base64.b64decode(content) == picture.read_bytes()
@@ -72,7 +72,7 @@ def test_the_page_holds_its_pictures_and_loads_nothing(tmp_path: Path) -> None:
 def test_links_of_both_files_lead_to_what_lies_beside_them(tmp_path: Path) -> None:
     picture, page = png(tmp_path / "reports/deep/a curve (1).png"), tmp_path / "reports/deep/viewer.html"
     page.write_text("<p>turn me</p>")
-    reader, markdown = written(tmp_path / "reports", Picture(picture, "The curve"), Page(page, "To be turned"))
+    reader, markdown = written(tmp_path / "reports", Picture(picture, "The curve"), EmbeddedPage(page, "To be turned"))
     found = [*re.findall(r"\]\(([^)\s]+)\)", markdown), reader.all("iframe")[0]["data-src"]]
     targets = {(tmp_path / "reports" / unquote(link or "")).resolve() for link in found}
     assert targets == {picture.resolve(), page.resolve()} and len(found) == 3

@@ -124,7 +124,7 @@ def test_ctrl_c_leaves_the_job_and_says_how_to_look_at_it(
 ) -> None:
     assert run(monkeypatch, Scripted(KeyboardInterrupt()), submitted) == 130
     said = capsys.readouterr().err
-    assert said.startswith("interrupted; the job goes on") and "ray job logs --follow raysubmit_x" in said
+    assert said.startswith("interrupted; the job continues") and "ray job logs --follow raysubmit_x" in said
     assert "run the same command again" not in said
 
 

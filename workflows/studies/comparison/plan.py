@@ -15,7 +15,7 @@ from datagen.recipe.text import faults_text, read_values
 from workflows.recipe.loader import WorkflowRecipe, file_of, known_files
 from workflows.studies.sweep.plan import Sweep, Trial, TrialEntry, resolve
 
-Kind = Literal["comparison", "ablation"]
+ComparisonKind = Literal["comparison", "ablation"]
 
 
 class MethodEntry(Frozen):
@@ -39,7 +39,7 @@ class ComparisonFile(Frozen):
 class ComparisonPlan:
     """Methods by the name that tables give them, each a trial of a sweep; ``name`` is the recipe's."""
 
-    kind: Kind
+    kind: ComparisonKind
     name: str
     description: str
     sweep: Sweep
@@ -56,12 +56,12 @@ class ComparisonPlan:
         return f"{'Comparison of methods' if self.kind == 'comparison' else 'Ablations of DSFFNet'}: {self.name}"
 
 
-def known_comparisons(kind: Kind) -> dict[str, Path]:
+def known_comparisons(kind: ComparisonKind) -> dict[str, Path]:
     """Comparisons of a kind that come with the project, by name."""
     return known_files(f"{kind}s")
 
 
-def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: Kind) -> ComparisonPlan:
+def plan_comparison(name_or_file: str, shared: Sequence[str] = (), *, kind: ComparisonKind) -> ComparisonPlan:
     """Resolve every method of a comparison, before anything is run.
 
     Parameters

@@ -8,7 +8,7 @@ from datagen.store import Dataset, open_dataset
 from training.evaluation.document import Text, plain
 from training.evaluation.evaluate import NO_OPS, Row, read_rows
 from training.evaluation.tables import emphasised
-from training.reports.blocks import Block, Code, Page, Picture, Section
+from training.reports.blocks import Block, Code, EmbeddedPage, Picture, Section
 from training.reports.cards import dataset_card, model_card
 from training.reports.report import write_report
 from training.reports.run_summary import what_was_run
@@ -46,7 +46,7 @@ def _figures(folder: Path) -> list[Block]:
         for name, caption in _FIGURES
         if (folder / "figures" / name).exists()
     ]
-    return [*pictures, Page(folder / "viewer.html", "The same transfers, to be turned with the mouse.")]
+    return [*pictures, EmbeddedPage(folder / "viewer.html", "The same transfers, to be turned with the mouse.")]
 
 
 def _methods(plan: ComparisonPlan) -> str:

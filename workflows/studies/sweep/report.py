@@ -36,7 +36,7 @@ machines, {threads} to each."""
 
 
 @dataclass(frozen=True)
-class Result:
+class TrialResult:
     """What one trial came to."""
 
     trial: Trial
@@ -76,18 +76,18 @@ def parse_levels(words: Sequence[str]) -> tuple[tuple[float, bool], ...]:
     return tuple((float(match[1]), bool(match[2])) for match in found if match)
 
 
-def results_of(sweep: Sweep, out: Path) -> list[Result]:
+def results_of(sweep: Sweep, out: Path) -> list[TrialResult]:
     """What is known of every trial, finished ones first, the lowest final PMD on unseen poses before the others."""
     found = [_result(trial, out) for trial in sweep.trials]
     return sorted(found, key=lambda result: (not result.finished, result.unseen.final))
 
 
-def best_of(results: Sequence[Result]) -> Result | None:
+def best_of(results: Sequence[TrialResult]) -> TrialResult | None:
     """The finished trial with the lowest final PMD on unseen poses, None where none has finished."""
     return next((result for result in results if result.finished and len(result.unseen)), None)
 
 
-def named_levels(results: Sequence[Result], levels: Sequence[tuple[float, bool]]) -> dict[str, float]:
+def named_levels(results: Sequence[TrialResult], levels: Sequence[tuple[float, bool]]) -> dict[str, float]:
     """Name -> PMD of each level; those that are times the best are left out where no trial has finished."""
     best = best_of(results)
     named = {}
@@ -102,7 +102,7 @@ def named_levels(results: Sequence[Result], levels: Sequence[tuple[float, bool]]
 
 def write_report(
     sweep: Sweep, out: Path, *, name: str, levels: Sequence[tuple[float, bool]], cpus: int
-) -> list[Result]:
+) -> list[TrialResult]:
     """Write what the trials' journals say now: sweep.md, sweep.csv, figures/sweep.png, best.yaml and the report."""
     from workflows.recipe.loader import save_recipe
 
@@ -136,7 +136,7 @@ def _write_page(out: Path, name: str, parts: Sequence[Text | Table]) -> None:
 
 
 def parts_of(
-    sweep: Sweep, results: Sequence[Result], *, levels: dict[str, float], cpus: int
+    sweep: Sweep, results: Sequence[TrialResult], *, levels: dict[str, float], cpus: int
 ) -> tuple[Text | Table, ...]:
     """The table with its definitions, what each trial sets, and why some failed."""
     best = best_of(results)
@@ -158,7 +158,7 @@ def parts_of(
     )
 
 
-def table(results: Sequence[Result], levels: dict[str, float]) -> list[list[str]]:
+def table(results: Sequence[TrialResult], levels: dict[str, float]) -> list[list[str]]:
     """Heading and one line a trial, as text."""
     reach = [heading for level in levels for heading in (f"step to {level}", "s")]
     ends = ["unseen, end", "best", "at step", "seen, end", "best"]
@@ -181,7 +181,7 @@ def table(results: Sequence[Result], levels: dict[str, float]) -> list[list[str]
     return lines
 
 
-def table_csv(sweep: Sweep, results: Sequence[Result], levels: dict[str, float]) -> str:
+def table_csv(sweep: Sweep, results: Sequence[TrialResult], levels: dict[str, float]) -> str:
     """The same for programs: PMD as measured (not times 1e4), and every varied key as a column."""
     rows = [_csv_row(sweep, result, levels) for result in results]
     text = io.StringIO()
@@ -191,7 +191,7 @@ def table_csv(sweep: Sweep, results: Sequence[Result], levels: dict[str, float])
     return text.getvalue()
 
 
-def _csv_row(sweep: Sweep, result: Result, levels: dict[str, float]) -> dict[str, object]:
+def _csv_row(sweep: Sweep, result: TrialResult, levels: dict[str, float]) -> dict[str, object]:
     values = varied_values(sweep, result.trial)
     row: dict[str, object] = {"trial": result.trial.name, "state": result.state, "reason": result.reason}
     row |= {key: values.get(key, "") for key in sweep.varied}
@@ -209,7 +209,7 @@ def _csv_row(sweep: Sweep, result: Result, levels: dict[str, float]) -> dict[str
     }
 
 
-def _result(trial: Trial, out: Path) -> Result:
+def _result(trial: Trial, out: Path) -> TrialResult:
     folder = trial.folder(out)
     record, rows = read_record(folder), read_journal(folder / "metrics.jsonl")
     state = _STATES[record.status] if record else "not begun"
@@ -220,7 +220,7 @@ def _result(trial: Trial, out: Path) -> Result:
         for pose_type in ("seen", "unseen")
     )
     clock = run_curve(rows, "meshes_per_second", batch=batch)
-    return Result(
+    return TrialResult(
         trial, state, reason, seen, unseen,
         steps=int(clock.steps[-1]) if len(clock) else 0,
         seconds=float(clock.seconds[-1]) if len(clock) else 0.0,

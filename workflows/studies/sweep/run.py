@@ -23,10 +23,10 @@ from workflows.recipe.loader import save_recipe
 from workflows.studies.sweep.plan import Sweep, Trial, varied_values, write_sweep
 from workflows.studies.sweep.progress import SweepProgress
 from workflows.studies.sweep.ray_trials import Outcome, Place, is_finished, prepare, ray_trials
-from workflows.studies.sweep.report import FILES, Result, best_of, results_of, write_report
+from workflows.studies.sweep.report import FILES, TrialResult, best_of, results_of, write_report
 
 Trials = Generator[Outcome | None, None, None]
-Runner = Callable[..., Trials]
+TrialRunner = Callable[..., Trials]
 """Runs trials somewhere, see :func:`workflows.studies.sweep.ray_trials.ray_trials`."""
 HEAD = ["recipe.yaml", "trials.yaml"]
 Made = TypeVar("Made")
@@ -56,7 +56,9 @@ class Work:
     tags: Callable[[Trial], dict[str, str]]
 
 
-def run_trials(work: Work, *, runner: Runner, finish: Finish[Made], told: Callable[[], None] = lambda: None) -> Made:
+def run_trials(
+    work: Work, *, runner: TrialRunner, finish: Finish[Made], told: Callable[[], None] = lambda: None
+) -> Made:
     """Make the dataset, train every trial that is not finished, and ``finish`` what came out, in one record.
 
     What is finished is skipped, without so much as starting Ray.
@@ -97,7 +99,7 @@ def _begin(around: ExitStack, work: Work) -> None:
 
 
 def _train(
-    work: Work, waiting: Sequence[Trial], runner: Runner, begin: Callable[[], None], told: Callable[[], None]
+    work: Work, waiting: Sequence[Trial], runner: TrialRunner, begin: Callable[[], None], told: Callable[[], None]
 ) -> list[Outcome]:
     begin()
     say(f"trials: {len(waiting)} begin")
@@ -125,14 +127,14 @@ def run_sweep(
     out: Path,
     settings: Settings,
     *,
-    runner: Runner = ray_trials,
-    show: Callable[[list[Result]], None] = lambda results: None,
-) -> list[Result]:
+    runner: TrialRunner = ray_trials,
+    show: Callable[[list[TrialResult]], None] = lambda results: None,
+) -> list[TrialResult]:
     """Dataset, trials and report into ``out``.
 
     Returns
     -------
-    list of Result
+    list of TrialResult
         Of all trials, the best first; ``show`` is given them before anything that failed is raised.
 
     Raises
@@ -142,7 +144,7 @@ def run_sweep(
     """
     report = partial(_report, sweep, out, settings)
 
-    def finish(outcomes: list[Outcome], begin: Callable[[], None]) -> list[Result]:
+    def finish(outcomes: list[Outcome], begin: Callable[[], None]) -> list[TrialResult]:
         if not has_record(out):
             begin()
             report()
@@ -176,7 +178,7 @@ def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
     update_record(out, tags=tags, metrics=metrics, artifacts=artifacts)
 
 
-def _write_report(sweep: Sweep, out: Path, settings: Settings) -> list[Result]:
+def _write_report(sweep: Sweep, out: Path, settings: Settings) -> list[TrialResult]:
     return write_report(sweep, out, name=settings.name, levels=settings.levels, cpus=settings.cpus)
 
 

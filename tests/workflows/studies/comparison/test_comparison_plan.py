@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from datagen.common.errors import RecipeError
-from workflows.studies.comparison.plan import Kind, known_comparisons, plan_comparison
+from workflows.studies.comparison.plan import ComparisonKind, known_comparisons, plan_comparison
 
-KINDS: tuple[Kind, ...] = ("comparison", "ablation")
+KINDS: tuple[ComparisonKind, ...] = ("comparison", "ablation")
 EVERY = [(kind, name) for kind in KINDS for name in known_comparisons(kind)]
 
 
@@ -17,7 +17,7 @@ def test_there_are_small_and_paper_sized_ones_for_humans_and_animals() -> None:
 
 
 @pytest.mark.parametrize(("kind", "name"), EVERY)
-def test_all_methods_learn_from_as_many_triples_of_one_dataset(kind: Kind, name: str) -> None:
+def test_all_methods_learn_from_as_many_triples_of_one_dataset(kind: ComparisonKind, name: str) -> None:
     comparison = plan_comparison(name, kind=kind)
     recipes = [trial.recipe for trial in comparison.methods.values()]
     assert all(recipe.data == recipes[0].data for recipe in recipes)

@@ -436,7 +436,7 @@ def test_stopped_and_killed_on_real_ray_it_ends_as_if_undisturbed_and_mlflow_sho
     assert workers
     workers[0].send_signal(signal.SIGKILL)  # Ray starts that trial again
     output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0 and "Go on with the best" in output, output
+    assert process.returncode == 0 and "Continue from the best" in output, output
 
     assert run(undisturbed, *LONG)[0] == 0
     for name in ("learning_rate=0.003", "learning_rate=0.001"):
