@@ -1,6 +1,6 @@
-"""The clips of a glTF file, and the rotations of its nodes at any moment of them (3.11, appendix C)."""
+"""The clips of a glTF file, and how its nodes and morph targets stand at any moment of them (3.11, appendix C)."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,48 +12,60 @@ from datagen.common.errors import BodyError
 from datagen.mesh.formats.gltf import Gltf, reading
 
 _CUBIC, _STEP = "CUBICSPLINE", "STEP"
+_WIDTHS = {"rotation": 4, "translation": 3, "scale": 3}
 
 
 @dataclass(frozen=True)
 class Track:
-    """Keyframes of a node's rotation: ``times`` [key] in seconds, ``values`` [key, 4] as (x, y, z, w).
+    """Keyframes of what moves a node: ``times`` [key] in seconds, ``values`` [key, n].
 
-    CUBICSPLINE has ``values`` [key, 3, 4]: in-tangent, value, out-tangent.
+    Rotations (``turns``) are quaternions (x, y, z, w); else they are factors or a place (n = 3), or weights of morph
+    targets. CUBICSPLINE has ``values`` [key, 3, n]: in-tangent, value, out-tangent.
     """
 
     times: NDArray[np.float64]
     values: NDArray[np.float64]
     interpolation: str
+    turns: bool = True
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """Return the unit quaternion [4] at ``time``; before the first and after the last key, that key's."""
-        cubic = self.interpolation == _CUBIC
+        """Return the value [n] at ``time``, of rotations a unit quaternion; outside of the keys the nearest key's."""
+        cubic, done = self.interpolation == _CUBIC, _unit if self.turns else np.asarray
         values = self.values[:, 1] if cubic else self.values
         after = int(np.searchsorted(self.times, time, side="right"))
         if after in (0, len(self.times)):
-            return _unit(values[min(after, len(values) - 1)])
+            return done(values[min(after, len(values) - 1)])
         before, width = after - 1, self.times[after] - self.times[after - 1]
         if self.interpolation == _STEP:
-            return _unit(values[before])
+            return done(values[before])
         share = (time - self.times[before]) / width
         if cubic:
             tangents = self.values[before, 2] * width, self.values[after, 0] * width
-            return _hermite(values[before], values[after], *tangents, share)
+            return done(_hermite(values[before], values[after], *tangents, share))
+        if not self.turns:
+            return values[before] + (values[after] - values[before]) * share
         return _slerp(_unit(values[before]), _unit(values[after]), share)
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A named animation from ``start`` to ``end`` (seconds), with the rotations of the nodes that it turns."""
+    """A named animation from ``start`` to ``end`` (seconds): a track for each node and what of it is moved.
+
+    That is ``rotation``, ``translation``, ``scale`` or ``weights``.
+    """
 
     name: str
     start: float
     end: float
-    rotations: dict[int, Track]
+    tracks: dict[tuple[int, str], Track]
+
+    def of(self, path: str) -> dict[int, Track]:
+        """Tracks of that kind by node."""
+        return {node: track for (node, its), track in self.tracks.items() if its == path}
 
 
-def read_clips(file: Gltf) -> dict[str, Clip]:
-    """Return the clips by name, in the file's order; those that turn nothing are left out.
+def read_clips(file: Gltf, paths: Collection[str] = ("rotation",)) -> dict[str, Clip]:
+    """Return the clips by name, in the file's order, with the tracks of ``paths``; those that have none are left out.
 
     Raises
     ------
@@ -63,8 +75,8 @@ def read_clips(file: Gltf) -> dict[str, Clip]:
     clips = []
     for number, animation in enumerate(file.json.get("animations", ())):
         with reading(file.path, f"animation {number}"):
-            clips.append(_clip(file, number, animation))
-    return {clip.name: clip for clip in clips if clip.rotations}
+            clips.append(_clip(file, number, animation, paths))
+    return {clip.name: clip for clip in clips if clip.tracks}
 
 
 def world_frames(file: Gltf, clip: Clip, time: float, nodes: Sequence[int]) -> NDArray[np.float64]:
@@ -78,7 +90,7 @@ def world_frames(file: Gltf, clip: Clip, time: float, nodes: Sequence[int]) -> N
         A keyframe is not a rotation.
     """
     rotations = file.rotations.copy()
-    for node, track in clip.rotations.items():
+    for node, track in clip.of("rotation").items():
         rotations[node] = track.at(time)
     if not np.isfinite(rotations).all():
         raise BodyError(f"{file.path}: clip {clip.name!r} has a key near {time:.2f} s that is no rotation. Repair it")
@@ -90,32 +102,35 @@ def world_frames(file: Gltf, clip: Clip, time: float, nodes: Sequence[int]) -> N
     return frames[list(nodes)]
 
 
-def _clip(file: Gltf, number: int, animation: dict[str, Any]) -> Clip:
-    tracks: dict[int, Track] = {}
+def _clip(file: Gltf, number: int, animation: dict[str, Any], paths: Collection[str]) -> Clip:
+    tracks: dict[tuple[int, str], Track] = {}
     for channel in animation["channels"]:
         target = channel["target"]
-        if target["path"] == "rotation" and "node" in target:
+        if target["path"] in paths and "node" in target:
             if not 0 <= target["node"] < len(file.nodes):
                 raise ValueError(f"there is no node {target['node']}")
-            tracks[target["node"]] = _track(file, animation["samplers"][channel["sampler"]])
+            sampler = animation["samplers"][channel["sampler"]]
+            tracks[target["node"], target["path"]] = _track(file, sampler, target["path"])
     start = min((track.times[0] for track in tracks.values()), default=0.0)
     end = max((track.times[-1] for track in tracks.values()), default=0.0)
     return Clip(str(animation.get("name") or f"clip{number}"), float(start), float(end), tracks)
 
 
-def _track(file: Gltf, sampler: dict[str, Any]) -> Track:
+def _track(file: Gltf, sampler: dict[str, Any], path: str) -> Track:
     interpolation = sampler.get("interpolation", "LINEAR")
     times = file.accessor(sampler["input"])[:, 0].astype(np.float64)
     values = file.accessor(sampler["output"]).astype(np.float64)
-    shape = (len(times), 3, 4) if interpolation == _CUBIC else (len(times), 4)
+    vectors = len(times) * (3 if interpolation == _CUBIC else 1)
+    width = _WIDTHS.get(path, values.size // max(vectors, 1))
     if (
         not np.isfinite(times).all()
         or not len(times)
-        or values.size != np.prod(shape)
+        or values.size != vectors * width
         or not (np.diff(times) > 0).all()
     ):
         raise BodyError(f"{file.path}: an animation's keyframes are damaged. Export it again")
-    return Track(times, values.reshape(shape), interpolation)
+    shape = (len(times), 3, width) if interpolation == _CUBIC else (len(times), width)
+    return Track(times, values.reshape(shape), interpolation, turns=path == "rotation")
 
 
 def _unit(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,7 +155,7 @@ def _hermite(
     arriving: NDArray[np.float64],
     share: float,
 ) -> NDArray[np.float64]:
-    """Appendix C.5: the cubic through two keys with the given tangents (already times the interval), renormalised."""
+    """Appendix C.5: the cubic through two keys with the given tangents (already times the interval)."""
     square, cube = share**2, share**3
     values = (2 * cube - 3 * square + 1) * first + (3 * square - 2 * cube) * second
-    return _unit(values + (cube - 2 * square + share) * leaving + (cube - square) * arriving)
+    return values + (cube - 2 * square + share) * leaving + (cube - square) * arriving

@@ -20,9 +20,7 @@ def _transfer_options(made: Parser) -> None:
     made.add_argument("paths", nargs="*", metavar="SOURCE TARGET", help="short for --source and --target")
     add_model_option(made)
     add_checkpoint_option(made)
-    made.add_argument(
-        "--source", metavar="A", help="mesh in the wanted pose, or a folder or pattern (w*.obj) of frames"
-    )
+    made.add_argument("--source", metavar="A", help="mesh in the wanted pose, or frames: a folder, a pattern (w*.obj)")
     made.add_argument("--target", metavar="B", help="mesh of the wanted identity")
     made.add_argument("--out", "-o", required=True, metavar="C", help="mesh to write; for frames a folder, or one .glb")
     for whose in ("source", "target"):
@@ -35,6 +33,11 @@ def _transfer_options(made: Parser) -> None:
         )
     made.add_argument("--force", action="store_true", help="without --model: pose even a person like an animal")
     _add_standing(made)
+    made.add_argument(
+        "--animation",
+        metavar="NAME",
+        help="of a GLB as source: every frame of its animation of that name, --fps a second",
+    )
     _add_extras(made)
     made.add_argument("--tracking-uri", metavar="URI", help="MLflow server of models:/ (default: MLFLOW_TRACKING_URI)")
 
@@ -74,9 +77,11 @@ def transfer_command(options: argparse.Namespace) -> None:
     examples:
       dsffnet transfer pose.obj person.glb -o posed.glb --picture --viewer
       dsffnet transfer walk/ person.glb -o walking.glb --smooth 7
+      dsffnet transfer character.glb person.glb --animation Walk -o walking.glb
       dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
       dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine
     """
+    from datagen.characters.motion import animation_names
     from datagen.mesh.geometries import listed
     from workflows.transfer.job import TransferJob
 
@@ -88,6 +93,11 @@ def transfer_command(options: argparse.Namespace) -> None:
         if len(mesh.geometries) > 1:
             taken = f"{mesh.path}: {listed(mesh.geometries)} as one body ({option} chooses among them)"
             print_text(printable(taken))
+    animations = animation_names(job.sources[0]) if job.animation is None else ()
+    if animations:
+        print_text(
+            printable(f"{source.path} is taken at rest; --animation NAME poses every frame of {listed(animations)}")
+        )
     with (
         weights_of(options) as weights,
         memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"),

@@ -3,9 +3,11 @@
 import argparse
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
+from datagen.characters.motion import Motion
 from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import MeshFile, check_writable, read_mesh_file
 from datagen.mesh.sequences import frames_of, is_pattern
@@ -20,7 +22,7 @@ class TransferJob:
     """One transfer, or one for each frame of a sequence.
 
     ``axes``: how source and target stand, None to find it; ``is_told``: a person has said so; ``window``: frames of
-    the smoothing; what follows is as on the command line.
+    the smoothing; what follows is as on the command line. A sequence is files, or an ``animation`` of one.
     """
 
     sources: list[Path]
@@ -37,6 +39,7 @@ class TransferJob:
     viewer: bool = False
     source_geometry: Sequence[str] = ()
     target_geometry: Sequence[str] = ()
+    animation: str | None = None
 
     @classmethod
     def from_options(cls, options: argparse.Namespace) -> "TransferJob":
@@ -52,15 +55,20 @@ class TransferJob:
         source, target = _two_meshes(options)
         if options.align and (options.up or options.front):
             raise RecipeError("--align finds how the meshes stand; leave it out to say it by --up and --front")
-        is_sequence = source.is_dir() or is_pattern(source)
+        is_of_files = source.is_dir() or is_pattern(source)
+        if options.animation is not None and is_of_files:
+            raise RecipeError(f"--animation is of one GLB file, but {source} is frames: leave it out")
+        is_sequence = is_of_files or options.animation is not None
         window = _frames_of_window(options.smooth, options.fps)
         if window and not is_sequence:
-            raise RecipeError(f"--smooth is for frames, but {source} is one mesh; name a folder, or a pattern (w*.obj)")
+            raise RecipeError(
+                f"--smooth is for frames, but {source} is one mesh; name a folder, a pattern (w*.obj) or an --animation"
+            )
         if options.project and not options.model:
             raise RecipeError("--project is for outputs of a network that is named: add --model, or leave it out")
         of_source, of_target = axes_of_both(options.up or UPRIGHT.up, options.front or UPRIGHT.front)
         return cls(
-            sources=frames_of(source) if is_sequence else [source],
+            sources=frames_of(source) if is_of_files else [source],
             target=target,
             out=Path(options.out),
             is_sequence=is_sequence,
@@ -77,7 +85,7 @@ class TransferJob:
         return not self.is_sequence or self.out.suffix.lower() == _ANIMATED
 
     @property
-    def animation(self) -> Path:
+    def animated(self) -> Path:
         """The animated GLB of a sequence."""
         return self.out if self.is_file else self.out / f"animation{_ANIMATED}"
 
@@ -88,7 +96,7 @@ class TransferJob:
     @property
     def outputs(self) -> list[Path]:
         """The file that is written, or the animation and the files of the frames."""
-        return [self.out] if self.is_file else [self.animation, *map(self.frame_file, self.sources)]
+        return [self.out] if self.is_file else [self.animated, *map(self.frame_file, range(self.count))]
 
     @property
     def drawn(self) -> list[Path]:
@@ -96,13 +104,31 @@ class TransferJob:
         wanted = {".png": self.picture, ".html": self.viewer}
         return [self.beside(suffix) for suffix, is_wanted in wanted.items() if is_wanted]
 
-    def frame_file(self, source: Path) -> Path:
+    @property
+    def count(self) -> int:
+        """Of sources: frames of a sequence, or one."""
+        return self._motion.count if self.animation is not None else len(self.sources)
+
+    def source(self, number: int) -> Path:
+        """What the source, or a frame of the sequence, is called; those of an animation are in one file."""
+        path = self.sources[0 if self.animation is not None else number]
+        return path.with_stem(f"{path.stem}-{number:04d}") if self.animation is not None else path
+
+    def frame_file(self, number: int) -> Path:
         """The file of one frame: named after the source's, of the target's format."""
-        return self.out / f"{source.stem}{self.target.suffix.lower()}"
+        return self.out / f"{self.source(number).stem}{self.target.suffix.lower()}"
 
     def read_source(self, number: int) -> MeshFile:
         """The source, or a frame of the sequence."""
+        if self.animation is not None:
+            return replace(self._motion.file, mesh=self._motion.mesh(number))
         return read_mesh_file(self.sources[number], geometries=self.source_geometry)
+
+    @cached_property
+    def _motion(self) -> Motion:
+        assert self.animation is not None
+        file = read_mesh_file(self.sources[0], geometries=self.source_geometry)
+        return Motion.of(file, self.animation, frames_per_second=self.fps)
 
     def read_target(self) -> MeshFile:
         """The target with all that is needed to write it again."""
@@ -134,7 +160,7 @@ class TransferJob:
             raise MeshError(f"{self.out} is a file; frames go into a folder, or into one .glb")
         else:
             # not yet the folder itself: it appears when the last frame is done
-            check_writable((self.out if self.out.is_dir() else self.out.parent) / self.animation.name)
+            check_writable((self.out if self.out.is_dir() else self.out.parent) / self.animated.name)
 
     def check_textures(self, source: MeshFile, target: MeshFile) -> None:
         """Refuse a picture in the place of a texture of the meshes, or of one that is copied beside the output.
@@ -158,7 +184,7 @@ def _beside(mesh: MeshFile) -> Iterable[str]:
     return mesh.content.companions().beside
 
 
-_SAME = ("fps", "refine", "picture", "viewer", "source_geometry", "target_geometry")
+_SAME = ("fps", "refine", "picture", "viewer", "source_geometry", "target_geometry", "animation")
 
 
 def _two_meshes(options: argparse.Namespace) -> tuple[Path, Path]:

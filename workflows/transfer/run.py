@@ -130,7 +130,7 @@ class TransferWork:
         return f"{done}, by the weights {self.by}" if self.by else done
 
     def _votes(self) -> list[NDArray[np.floating]]:
-        count = len(self.job.sources)
+        count = self.job.count
         others = {count * place // _VOTING_FRAMES for place in range(1, _VOTING_FRAMES)} - {0}
         return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
 
@@ -144,20 +144,20 @@ class TransferWork:
 
     def _write_sequence(self) -> str:
         job = self.job
-        about = f"{job.out}: {len(job.sources)} frames of {job.target}"
+        about = f"{job.out}: {job.count} frames of {job.target}"
         if job.is_file:
-            require_animation(self.target, len(job.sources))
-            self._animate(self._kept(), job.animation)
+            require_animation(self.target, job.count)
+            self._animate(self._kept(), job.animated)
             return about
         with _appearing_whole(job.out, own={path.name for path in job.outputs}) as folder:
             try:
-                require_animation(self.target, len(job.sources))
+                require_animation(self.target, job.count)
             except MeshError as error:
-                warn(f"no {job.animation.name}: {error}")
+                warn(f"no {job.animated.name}: {error}")
                 deque(self._saved(folder), maxlen=0)
                 return about
-            self._animate(self._saved(folder), folder / job.animation.name)
-        return f"{about}, and all of them in {job.animation.name}"
+            self._animate(self._saved(folder), folder / job.animated.name)
+        return f"{about}, and all of them in {job.animated.name}"
 
     def _animate(self, frames: Iterable[Mesh], out: Path) -> None:
         vertices = (frame.vertices for frame in frames)
@@ -166,7 +166,7 @@ class TransferWork:
     def _saved(self, folder: Path) -> Iterator[Mesh]:
         """The frames, each written to its file as it passes."""
         for number, posed in enumerate(self._kept()):
-            place = folder / self.job.frame_file(self.job.sources[number]).name
+            place = folder / self.job.frame_file(number).name
             self._write_posed(posed, place, beside=not number)  # what lies beside the first lies beside all
             yield posed
 
@@ -178,7 +178,7 @@ class TransferWork:
     def posed(self) -> Iterator[Mesh]:
         """The target in the pose of every source, one after the other."""
         return self.transfer.sequence(
-            map(self._source, range(len(self.job.sources))),
+            map(self._source, range(self.job.count)),
             self.target.mesh,
             smooth=self.job.window,
             refine=REFINE_WEIGHT if self.job.refine else 0.0,
@@ -188,7 +188,7 @@ class TransferWork:
 
     def _kept(self) -> Iterator[Mesh]:
         """The outputs, with a bar for those of a sequence; those that picture and page show are kept."""
-        count = len(self.job.sources)
+        count = self.job.count
         kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
         played = range(0, count, self._frames_apart) if self._is_played else range(0)
         frames = self.posed()
@@ -212,7 +212,7 @@ class TransferWork:
         """The page of a sequence shows every so manieth frame; where that is not all, a line says so."""
         from training.viz.viewer import MOTION_LIMIT, frames_apart
 
-        count = len(self.job.sources)
+        count = self.job.count
         apart = frames_apart(count, len(self.first.vertices) + len(self.target.mesh.vertices))
         if apart > 1:
             warn(
@@ -236,7 +236,7 @@ class TransferWork:
             write_page([self._sequence(target)] if job.is_sequence else rows, job.beside(".html"))
 
     def _place(self, number: int) -> Path:
-        return self.job.frame_file(self.job.sources[number]) if self.job.is_sequence else self.job.out
+        return self.job.frame_file(number) if self.job.is_sequence else self.job.out
 
     def _sequence(self, target: "NamedMesh") -> "Comparison":
         """All frames that the page plays, as one transfer that moves."""
@@ -248,12 +248,16 @@ class TransferWork:
             for number, posed in self._played.items()
         ]
         motion = Motion(frames, self.job.fps / self._frames_apart)
-        count = len(self.job.sources)
-        title = f"{target.name} in the poses of {self.job.sources[0].parent.resolve().name} ({count:,} frames)"
+        title = f"{target.name} in the poses of {self._sequence_name} ({self.job.count:,} frames)"
         return shown(frames[0][0], target, frames[0][1], motion=motion, title=title)
 
+    @property
+    def _sequence_name(self) -> str:
+        first = self.job.sources[0]
+        return first.parent.resolve().name if self.job.animation is None else f"{first.name}: {self.job.animation}"
+
     def _upright_source(self, number: int) -> "NamedMesh":
-        return _upright(self._source(number), self.axes[0], self.job.sources[number], self._source_look)
+        return _upright(self._source(number), self.axes[0], self.job.source(number), self._source_look)
 
     def _upright_target(self, mesh: Mesh, path: Path) -> "NamedMesh":
         return _upright(mesh, self.axes[1], path, self._target_look)

@@ -106,9 +106,21 @@ class GlbContent(Alone):
         for piece in self._pieces:
             firsts.setdefault(piece.accessor, piece)
         self._firsts = list(firsts.values())
-        positions = [self._positions(piece) for piece in self._firsts]
-        self.vertices = np.concatenate([np.empty((0, 3)), *positions])
+        self.vertices = self.moved(file.world, {})
         self.draft()  # what cannot be read is to be known now, not when all is computed
+
+    @property
+    def gltf(self) -> Gltf:
+        """The file with all that moves it."""
+        return self._file
+
+    def moved(self, world: NDArray[np.float64], weights: Mapping[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return vertices [n, 3] where the nodes stand so: ``world`` [node, 4, 4].
+
+        ``weights`` [target] of morph targets by node; those that are not there are the file's own.
+        """
+        positions = [self._positions(piece, world, weights) for piece in self._firsts]
+        return np.concatenate([np.empty((0, 3)), *positions])
 
     @property
     def extents(self) -> dict[str, NDArray[np.float64]]:
@@ -162,21 +174,26 @@ class GlbContent(Alone):
             if there != size:
                 raise ValueError(f"{name} has {there} elements for {size} vertices")
 
-    def _positions(self, piece: Piece) -> NDArray[np.float64]:
+    def _positions(
+        self, piece: Piece, world: NDArray[np.float64], animated: Mapping[int, NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
         """World positions [vertex, 3] of the accessor that a piece uses."""
         attributes, node = piece.json["attributes"], self._file.nodes[piece.node]
         local = self._file.accessor(attributes["POSITION"]).astype(np.float64)
-        weights = node.get("weights", self._file.json["meshes"][node["mesh"]].get("weights", ()))
+        own = node.get("weights", self._file.json["meshes"][node["mesh"]].get("weights", ()))
+        weights = animated.get(piece.node, own)
         for weight, target in zip(weights, piece.json.get("targets", ()), strict=False):
             if weight and "POSITION" in target:
                 local = local + weight * self._file.accessor(target["POSITION"])
         if "skin" not in node or "JOINTS_0" not in attributes:
-            return _moved(local, self._file.world[piece.node])
-        return self._skinned(local, attributes, self._file.json["skins"][node["skin"]])
+            return _moved(local, world[piece.node])
+        return self._skinned(local, attributes, self._file.json["skins"][node["skin"]], world)
 
-    def _skinned(self, local: NDArray[np.float64], attributes: Json, skin: Json) -> NDArray[np.float64]:
-        """Positions as the skin shows them at rest; the node's own transform does not matter then (3.7.3.3)."""
-        joints = self._file.world[skin["joints"]] @ self._file.inverse_bind(skin)
+    def _skinned(
+        self, local: NDArray[np.float64], attributes: Json, skin: Json, world: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Positions as the skin shows them; the node's own transform does not matter then (3.7.3.3)."""
+        joints = world[skin["joints"]] @ self._file.inverse_bind(skin)
         numbers, weights = self._file.influences(attributes)
         weights = weights / np.maximum(weights.astype(np.float64).sum(axis=1, keepdims=True), 1e-12)
         total = np.zeros_like(local)

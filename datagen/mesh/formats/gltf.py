@@ -114,7 +114,11 @@ class Gltf:
     @cached_property
     def world(self) -> NDArray[np.float64]:
         """Matrices [node, 4, 4] of the nodes in the scene at rest."""
-        world = self.local.copy()
+        return self.in_scene(self.local)
+
+    def in_scene(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return matrices [node, 4, 4] of the nodes in the scene, of those relative to their parents."""
+        world = local.copy()
         for number in self.order:
             if self.parents[number] >= 0:
                 world[number] = world[self.parents[number]] @ world[number]

@@ -205,6 +205,24 @@ def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path)
     assert files(tmp_path) == ["walked.glb"]
 
 
+def test_an_animation_of_a_glb_is_posed_as_its_frames_in_files(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [read_mesh_file(f"walk/frame_{number}.ply") for number in range(12)]
+    walk = tmp_path / "walk.glb"
+    mesh_sequences.write_animation(frames[0], [each.mesh.vertices for each in frames], walk, frames_per_second=30)
+    transfer(walk, "person.obj", "-o", tmp_path / "one.obj")
+    assert "walk.glb is taken at rest; --animation NAME poses every frame of 'poses'" in capsys.readouterr().out
+    transfer(walk, "person.obj", "--animation", "poses", "-o", tmp_path / "frames", "--smooth", "3")
+    transfer("walk", "person.obj", "-o", tmp_path / "expected", "--smooth", "3")
+    for number in range(12):
+        found = load_mesh(tmp_path / "frames" / f"walk-{number:04d}.obj").vertices
+        assert np.allclose(found, load_mesh(tmp_path / "expected" / f"frame_{number}.obj").vertices, atol=2e-4)
+    transfer(walk, "person.obj", "--animation", "poses", "--fps", 15, "-o", tmp_path / "a.glb", "--picture", "--viewer")
+    assert "a.glb: 6 frames" in capsys.readouterr().out
+    assert "walk.glb: poses (6 frames)" in (tmp_path / "a.html").read_text()
+
+
 @pytest.mark.parametrize(("limit", "shown"), [(None, range(12)), (25_000, range(0, 12, 4))])
 def test_the_page_of_a_sequence_plays_its_frames_or_says_how_many(
     transfer: Transfer,
@@ -386,6 +404,8 @@ def test_more_frames_than_an_animation_holds_are_said_before_any_is_made(
         (("pose.obj", "person.obj", "-o", "x.obj", "--align", "--up", "Z"), RecipeError, "--align finds"),
         (("walk", "person.obj", "-o", "x.glb", "--smooth", "much"), RecipeError, "'much'"),
         (("pose.obj", "person.obj", "-o", "x.obj", "--smooth", "7"), RecipeError, "pose.obj is one mesh"),
+        (("walk", "person.obj", "-o", "x.glb", "--animation", "a"), RecipeError, "walk is frames: leave it out"),
+        (("pose.obj", "person.obj", "-o", "x.glb", "--animation", "a"), MeshError, "pose.obj has no animation 'a'"),
         (("pose.obj", "person.obj", "-o", "taken.obj", "--picture"), MeshError, "taken.png is a folder"),
     ],
 )
