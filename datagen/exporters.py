@@ -1,6 +1,7 @@
 """Datasets as mesh files: in the layout that peers' code trains on, or as folders for people to look through."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -11,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError, RecipeError, StorageError
+from datagen.common.errors import DatasetError, MeshError, RecipeError, StorageError
 from datagen.common.files import write_atomically
 from datagen.grid import POSE_TYPES
 from datagen.mesh.files import save_mesh
@@ -20,6 +21,7 @@ from datagen.mesh.formats.glb_writer import Draft
 from datagen.mesh.formats.obj import face_lines, vertex_lines
 from datagen.mesh.formats.surface import Material, linear
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.limits import FRAME_LIMIT
 from datagen.mesh.parts import part_colors, part_name
 from datagen.store import Dataset
 
@@ -92,7 +94,7 @@ def export_dataset(
     DatasetError
         The folder is a file, or holds something other than an export of this dataset in this layout.
     MeshError
-        An animation of more than 2,000 poses.
+        An animation of more than 2,000 poses; nothing is written.
     StorageError
         A file could not be written, such as on a full disk; those that are there are whole.
     """
@@ -100,6 +102,7 @@ def export_dataset(
     if layout not in get_args(ExportLayout):
         raise RecipeError(f"no layout {layout!r} to export to; there are {', '.join(get_args(ExportLayout))}")
     place, names, cells = Path(folder), _Names(layout, prefix), _cells(dataset, identities, poses)
+    _require_playable(names, cells)
     try:
         _claim(place, _readme(dataset, names, cells))
         return _export(dataset, place, names, progress(cells), fresh)
@@ -184,6 +187,15 @@ def _cells(dataset: Dataset, identities: Iterable[int] | None, poses: Iterable[i
             "what there is; training identities are in the seen poses only"
         )
     return cells
+
+
+def _require_playable(names: _Names, cells: list[Cell]) -> None:
+    most = max(Counter(map(names.of, cells)).values())
+    if names.layout == "glb-animated" and most > FRAME_LIMIT:
+        raise MeshError(
+            f"{most:,} poses of an identity are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere. "
+            "Choose fewer by --poses"
+        )
 
 
 def _require(what: str, numbers: Iterable[int], count: int) -> None:

@@ -1,11 +1,15 @@
-"""What is said of a result: numbers, the bar of the error map, and the colours of clothes."""
+"""What is said of a result: numbers, warnings in the page's words, the error map's bar, and the colours of clothes."""
 
+import re
 from html import escape
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.arrays import Floats
+from datagen.common.printable import printable
+from datagen.mesh.geometries import CHOOSE
 from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
 from training.viz.style import ERROR_COLORS, ROLE_COLORS
 from workflows.demo.transfers import Outcome, Posed
@@ -16,7 +20,23 @@ _DRAPED = (
     "The truth of a person in clothes is the outfit draped over them in the source's pose. It takes a second or "
     "two, and is not made of what is played."
 )
+_OF_THE_PAGE = {
+    f"Choose with {CHOOSE}": "Choose among them",
+    "choose it by --source-geometry or --target-geometry": "choose its geometries",
+    "look at --picture": "look at it",
+    "add --": "choose --",
+}
+"""What messages say that a command line is to do, and what is done here."""
+_OPTION = re.compile(r"(?<!\S)--([a-z]+)(=?)")
 _BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
+
+
+def plain(message: object, folder: Path) -> str:
+    """A message in which files below ``folder`` are called by their names, and options as the controls are."""
+    text = re.sub(rf"{re.escape(str(folder))}/([\w-]+/)*", "", str(message))
+    for words, ours in _OF_THE_PAGE.items():
+        text = text.replace(words, ours)
+    return printable(_OPTION.sub(lambda option: f"{option[1].capitalize()}{' ' if option[2] else ''}", text))
 
 
 def dressed_colors(role: str, garments: NDArray[np.integer] | None) -> Floats | None:
@@ -34,11 +54,12 @@ def label(outcome: Outcome, frame: Posed) -> str:
     return "draping the truth …" if outcome.asked.draped and outcome.waits_for_draping else ""
 
 
-def about(outcome: Outcome) -> str:
+def about(outcome: Outcome, folder: Path) -> str:
+    """How much was posed and how fast, and what is to be known of the meshes, which lie below ``folder``."""
     vertices = f"{len(outcome.file.mesh.vertices):,} vertices"
     frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
     lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
-    return "\n\n".join([*lines, *(f"⚠ {warning}" for warning in outcome.warnings)])
+    return "\n\n".join([*lines, *(f"⚠ {plain(warning, folder)}" for warning in outcome.warnings)])
 
 
 def legend(outcome: Outcome, frame: Posed, worst: float, *, shown: bool) -> str:
@@ -46,7 +67,7 @@ def legend(outcome: Outcome, frame: Posed, worst: float, *, shown: bool) -> str:
     if not shown:
         return ""
     if frame.pmd is None:
-        words = _DRAPED if outcome.asked.needs_draping else _UNKNOWN
+        words = outcome.no_truth or (_DRAPED if outcome.asked.needs_draping else _UNKNOWN)
         return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>'
     ticks = "".join(f"<span>{100 * worst * share:.1f}</span>" for share in (0, 0.5, 1))
     return (

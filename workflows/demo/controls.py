@@ -29,6 +29,12 @@ _HINTS = {
     "gender": "0 male, 1 female", "age": "0 baby, 1/3 child, 2/3 young adult, 1 old", "muscle": "0 slight, 1 muscular",
     "weight": "0 thin, 1 heavy", "height": "0 short, 1 tall", "proportions": "0 ideal, 1 uncommon",
 }  # fmt: skip
+_FORMATS = "OBJ, PLY, GLB, OFF, STL"
+_TAKES = {
+    True: f"{_FORMATS} (an animated GLB is played), or a .zip of frames",
+    False: f"{_FORMATS}, or a .zip with its materials",
+}
+"""What may be uploaded as source, and as target."""
 _SHOWN_PROPORTIONS = ("torso length", "neck length", "head size", "limb length", "limb girth", "tail length")
 
 
@@ -41,14 +47,14 @@ class BodyControls:
         first: Figure,
         keep: Callable[[str, bytes], tuple[Path, ...]],
         *,
-        keep_poses: Callable[[str, bytes], PoseFile] | None,
+        is_source: bool,
+        keep_poses: Callable[[str, bytes], PoseFile],
         changed: Callable[[], None],
         failed: Callable[[str], None],
-        takes: str,
     ) -> None:
-        """``keep`` takes an upload, ``keep_poses`` one of poses (None of the target, which is offered clothes).
+        """The source is offered poses and what is played, the target clothes.
 
-        ``changed`` is called after every change, ``takes`` says what may be uploaded.
+        ``keep`` takes an upload, ``keep_poses`` one of poses; ``changed`` is called after every change.
         """
         self._gui, self._changed = gui, changed
         self._random = np.random.default_rng()
@@ -56,14 +62,18 @@ class BodyControls:
         kinds = [name for name, kind in KINDS.items() if kind == PERSON or animals_are_there()]
         self._kind = gui.add_dropdown("Body", (*kinds, OWN))
         self._detail = gui.add_dropdown("Mesh", tuple(DETAILS), hint="Anny's topologies; fewer vertices are faster")
-        self._outfit = (
-            gui.add_dropdown("Outfit", CLOTHES, hint="people in clothes stand at rest") if not keep_poses else None
-        )
+        self._outfit = None
+        if not is_source:
+            self._outfit = gui.add_dropdown("Outfit", CLOTHES, hint="people in clothes stand at rest")
         self._species = gui.add_dropdown("Species", SPECIES) if len(kinds) > 1 else None
         self._sliders = {PERSON: self._phenotypes(first), ANIMAL: self._proportions() if self._species else {}}
-        self._poses = PoseControls(gui, first.pose, keep=keep_poses, changed=changed, failed=failed)
+        self._poses = PoseControls(
+            gui, first.pose, is_source=is_source, keep=keep_poses, changed=changed, failed=failed
+        )
         self._another = gui.add_button("Another at random", icon=viser.Icon.DICE_5, color="gray")
-        self._file = MeshFileControls(gui, takes, accepted=ACCEPTED, keep=keep, changed=changed, failed=failed)
+        self._file = MeshFileControls(
+            gui, _TAKES[is_source], accepted=ACCEPTED, keep=keep, changed=changed, failed=failed, plays=is_source
+        )
         self._missing = None if self._species else gui.add_markdown(ANIMALS_MISSING)
         self._listen()
         self._arrange()
@@ -86,6 +96,11 @@ class BodyControls:
     def geometries(self) -> tuple[str, ...]:
         """Of a mesh of one's own, those that are taken; none for all."""
         return () if self._kind.value in KINDS else self._file.geometries
+
+    @property
+    def animation(self) -> str | None:
+        """Of a mesh of one's own, the animation that is played."""
+        return None if self._kind.value in KINDS else self._file.animation
 
     def draw(self) -> None:
         """Another body at random, in another pose."""

@@ -1,4 +1,5 @@
-"""Where a person gives a file: a place to drop it, what became of it, and which of its geometries are taken."""
+"""Where a person gives a file: a button to choose it, what became of it, which of its geometries and animations are
+taken."""
 
 import logging
 from collections.abc import Callable
@@ -6,13 +7,15 @@ from pathlib import Path
 
 import viser
 
+from datagen.characters.motion import animation_names
 from datagen.common.errors import DsffnetError, NotOneBodyError
 from datagen.mesh.files import geometry_names
 from workflows.demo.transfers import read
 from workflows.demo.uploads import BYTE_LIMIT, FRAME_LIMIT
 
 log = logging.getLogger(__name__)
-_LISTED = 24  # geometries that are offered; of more, dsffnet transfer chooses
+_LISTED = 24  # geometries and animations that are offered; of more, dsffnet transfer chooses
+_AT_REST = "none: at rest"
 
 
 class FileControls:
@@ -51,7 +54,7 @@ class FileControls:
 
 
 class MeshFileControls(FileControls):
-    """A mesh of one's own, or frames of one, and a box to tick for each of its geometries."""
+    """A mesh of one's own, or frames of one: a box to tick for each of its geometries, and its animations."""
 
     def __init__(
         self,
@@ -62,14 +65,16 @@ class MeshFileControls(FileControls):
         keep: Callable[[str, bytes], tuple[Path, ...]],
         changed: Callable[[], None],
         failed: Callable[[str], None],
+        plays: bool,
     ) -> None:
-        """``keep`` takes an upload, ``changed`` is called after every change."""
+        """``keep`` takes an upload, ``changed`` is called after every change; ``plays``: animations are offered."""
         super().__init__(gui, takes, accepted=accepted, take=self._keep_mesh, failed=failed)
-        self._gui, self._keep, self._changed = gui, keep, changed
+        self._gui, self._keep, self._changed, self._plays = gui, keep, changed, plays
         self._files: tuple[Path, ...] = ()
         self._all: set[str] = set()  # what is taken where nothing is chosen
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
         self._choice: viser.GuiFolderHandle | None = None
+        self._animation: viser.GuiDropdownHandle[str] | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -82,6 +87,12 @@ class MeshFileControls(FileControls):
         return () if set(self._ticked) == self._all else self._ticked
 
     @property
+    def animation(self) -> str | None:
+        """Name of the animation that is played; None for the mesh at rest."""
+        chosen = self._animation.value if self._animation else _AT_REST
+        return None if chosen == _AT_REST else chosen
+
+    @property
     def _ticked(self) -> tuple[str, ...]:
         return tuple(name for name, box in self._boxes.items() if box.value)
 
@@ -90,6 +101,7 @@ class MeshFileControls(FileControls):
         names, self._all, remark = _geometries(files[0])
         self._files = files
         self._offer(names)
+        self._offer_animations(animation_names(files[0]) if self._plays and len(files) == 1 else ())
         if remark:
             self._failed(remark)
         self._changed()
@@ -109,6 +121,17 @@ class MeshFileControls(FileControls):
             for name in names:
                 self._boxes[name] = self._gui.add_checkbox(name, name in self._all)
                 self._boxes[name].on_update(lambda _: self._changed())
+
+    def _offer_animations(self, names: tuple[str, ...]) -> None:
+        """A list of them, the first one chosen, in the place of the last file's."""
+        if self._animation:
+            self._animation.remove()
+        self._animation = None
+        if not names:
+            return
+        with self.folder:
+            self._animation = self._gui.add_dropdown("Animation", (*names[:_LISTED], _AT_REST))
+        self._animation.on_update(lambda _: self._changed())
 
 
 def _geometries(path: Path) -> tuple[tuple[str, ...], set[str], str]:

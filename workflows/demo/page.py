@@ -9,10 +9,10 @@ import viser
 
 from datagen.common.errors import DsffnetError
 from training.viz.style import error_colors
-from workflows.demo.bodies import Figure, garments_of, random_figure
-from workflows.demo.captions import about, dressed_colors, label, legend
+from workflows.demo.bodies import Figure, random_figure
+from workflows.demo.captions import about, dressed_colors, label, legend, plain
 from workflows.demo.controls import BodyControls
-from workflows.demo.poses import PERSON, PoseFile
+from workflows.demo.poses import PERSON
 from workflows.demo.session import Session
 from workflows.demo.stage import Stage
 from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers, clash_of
@@ -66,7 +66,8 @@ class Page:
         if clash:
             self._status.content = f"**Up and Front.** {clash}"
             return
-        moving = self._moving.value or (not isinstance(source, Figure) and len(source) > 1)
+        is_sequence = not isinstance(source, Figure) and (len(source) > 1 or self._source.animation is not None)
+        moving = self._moving.value or is_sequence
         self.session.ask(Asked(source, target, self._switches(), moving=moving, draped=self._errors.value))
 
     def posing(self) -> None:
@@ -81,7 +82,7 @@ class Page:
         if len(outcome.frames) == 1:
             self._draw(outcome, outcome.frames[0])
             self._stage.arrange()
-        self._status.content = about(outcome)
+        self._status.content = about(outcome, self.session.folder)
 
     def fail(self, message: str) -> None:
         """Say what cannot be done; what is shown stays."""
@@ -100,40 +101,36 @@ class Page:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Source", viser.Icon.RUN):
             gui.add_markdown("Gives the **pose**.")
-            takes = "OBJ, PLY, GLB, OFF, STL, or a .zip of frames"
-            self._source = self._controls("source", random_figure(PERSON, random), takes, poses=self.session.keep_poses)
+            self._source = self._controls("source", random_figure(PERSON, random))
         with tabs.add_tab("Target", viser.Icon.USER):
             gui.add_markdown("Gives the **body**; its own pose does not matter.")
-            takes = "OBJ, PLY, GLB, OFF, STL, or a .zip with its materials"
-            self._target = self._controls("target", random_figure(PERSON, random), takes)
+            self._target = self._controls("target", random_figure(PERSON, random))
         with tabs.add_tab("Options", viser.Icon.ADJUSTMENTS):
             self._add_switches()
 
-    def _controls(
-        self, role: str, first: Figure, takes: str, poses: Callable[[str, bytes], PoseFile] | None = None
-    ) -> BodyControls:
+    def _controls(self, role: str, first: Figure) -> BodyControls:
         def keep(name: str, content: bytes) -> tuple[Path, ...]:
             return self.session.keep(role, name, content)
 
         return BodyControls(
-            self._client.gui, first, keep, keep_poses=poses, changed=self.ask,
-            failed=lambda error: self.fail(self.session.plain(error)), takes=takes,
+            self._client.gui, first, keep, is_source=role == "source", keep_poses=self.session.keep_poses,
+            changed=self.ask, failed=lambda error: self.fail(plain(error, self.session.folder)),
         )  # fmt: skip
 
     def _add_switches(self) -> None:
         gui, own = self._client.gui, self._transfers.weights is None
-        self._refine = gui.add_checkbox("Refine", False, hint="pull the edges back to the target's (--refine)")
-        self._smooth = gui.add_checkbox("Smooth", False, hint=f"frames over {_SMOOTH_FRAMES} of them (--smooth)")
+        self._refine = gui.add_checkbox("Refine", False, hint="pull the edges back to the target's")
+        self._smooth = gui.add_checkbox("Smooth", False, hint=f"frames over {_SMOOTH_FRAMES} of them")
         self._align = gui.add_checkbox(
-            "Align", False, hint="find how each mesh stands (--align)", visible=not self._transfers.finds_standing
+            "Align", False, hint="find how each mesh stands", visible=not self._transfers.finds_standing
         )
-        self._force = gui.add_checkbox("Force", False, hint="pose even a person like an animal (--force)", visible=own)
+        self._force = gui.add_checkbox("Force", False, hint="pose even a person like an animal", visible=own)
         self._project = gui.add_dropdown(
-            "Project", (_WITHOUT, "human", "animals"), hint="fit the target's rigid parts (--project)", visible=not own
+            "Project", (_WITHOUT, "human", "animals"), hint="fit the target's rigid parts", visible=not own
         )
         axes = (_AS_FOUND, "X", "Y", "Z", "-X", "-Y", "-Z")
-        self._up = gui.add_dropdown("Up", axes, hint="where the heads of your meshes are (--up)")
-        self._front = gui.add_dropdown("Front", axes, hint="where your meshes face (--front)")
+        self._up = gui.add_dropdown("Up", axes, hint="where the heads of your meshes are")
+        self._front = gui.add_dropdown("Front", axes, hint="where your meshes face")
         for handle in (self._refine, self._smooth, self._align, self._force, self._project, self._up, self._front):
             handle.on_update(lambda _: self.ask())
 
@@ -163,6 +160,7 @@ class Page:
             smooth=str(_SMOOTH_FRAMES) if self._smooth.value else "0",
             source_geometry=self._source.geometries,
             target_geometry=self._target.geometries,
+            animation=self._source.animation,
         )
 
     def _downloading(self, suffix: str) -> Callable[[object], None]:
@@ -170,7 +168,7 @@ class Page:
             try:
                 result = self.session.result(suffix)
             except DsffnetError as error:
-                self._client.add_notification("Nothing to download", self.session.plain(error), color="red")
+                self._client.add_notification("Nothing to download", plain(error, self.session.folder), color="red")
             else:
                 self._client.send_file_download(result.name, result.content, save_immediately=True)
                 if result.left_out:
@@ -193,10 +191,10 @@ class Page:
 
     def _draw(self, outcome: Outcome, frame: Posed) -> None:
         with self._drawing, self._client.atomic():
+            garments = outcome.garments
             sizes = {role: float(np.ptp(getattr(frame, role).vertices, axis=0).max()) for role in ("source", "target")}
             errors = frame.errors if self._errors.value else None
             worst = float(np.percentile(errors, 99)) if errors is not None else 1.0
-            garments = garments_of(outcome.asked.target) if isinstance(outcome.asked.target, Figure) else None
             self._stage.show("source", frame.source, unit=sizes["source"])
             self._stage.show("target", frame.target, unit=sizes["target"], colors=dressed_colors("target", garments))
             colors = dressed_colors("output", garments) if errors is None else error_colors(errors, worst)

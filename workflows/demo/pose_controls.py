@@ -19,30 +19,29 @@ _AXES = {
 
 
 class PoseControls:
-    """A slider of poses; of a person who gives the pose (``keep`` takes their file) also joints and a file."""
+    """A slider of poses; of the source, if it is a person, also joints and a file of poses (``keep`` takes it)."""
 
     def __init__(
         self,
         gui: viser.GuiApi,
         first: Pose,
         *,
-        keep: Callable[[str, bytes], PoseFile] | None,
+        is_source: bool,
+        keep: Callable[[str, bytes], PoseFile],
         changed: Callable[[], None],
         failed: Callable[[str], None],
     ) -> None:
         """``changed`` is called after every change."""
-        self._gui, self._keep, self._changed = gui, keep, changed
+        self._gui, self._is_source, self._keep, self._changed = gui, is_source, keep, changed
         self._is_setting = False
-        self._from = gui.add_dropdown("Poses", (_RANDOM, _OWN), visible=keep is not None)
+        self._from = gui.add_dropdown("Poses", (_RANDOM, _OWN), visible=is_source)
         self._number = gui.add_slider(
             "Pose", 0, LAST_POSE, 1, int(first.number), hint="0: at rest; the others are random, none was in training"
         )
-        self._files = None
-        if keep:
-            self._files = FileControls(gui, _TAKES, accepted=POSES, take=self._take, failed=failed)
+        self._files = FileControls(gui, _TAKES, accepted=POSES, take=self._take, failed=failed) if is_source else None
         self._poses: PoseFile | None = None
         self._place: viser.GuiSliderHandle[int] | None = None
-        self._turns = JointControls(gui, changed) if keep else None
+        self._turns = JointControls(gui, changed) if is_source else None
         self._number.on_update(lambda _: None if self._is_setting else changed())
         self._from.on_update(lambda _: self._choose_source())
         self.arrange(is_shown=True, is_person=True)
@@ -67,7 +66,7 @@ class PoseControls:
         self._is_shown, self._is_person = is_shown, is_person
         own = is_shown and self._plays_file
         self._number.visible = is_shown and not own
-        self._from.visible = is_shown and is_person and self._keep is not None
+        self._from.visible = is_shown and is_person and self._is_source
         if self._files:
             self._files.folder.visible = own
         if self._turns:
@@ -82,7 +81,7 @@ class PoseControls:
         self._changed()
 
     def _take(self, name: str, content: bytes) -> str:
-        assert self._keep and self._files
+        assert self._files
         self._poses = poses = self._keep(name, content)
         if self._place:
             self._place.remove()

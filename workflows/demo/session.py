@@ -2,8 +2,6 @@
 
 import contextlib
 import io
-import logging
-import re
 import shutil
 import tempfile
 import threading
@@ -14,18 +12,15 @@ from itertools import count
 from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from datagen.common.errors import DsffnetError, MeshError, NotOneBodyError
-from datagen.common.printable import printable
-from datagen.common.resources import ran_out_of_memory
+from datagen.common.errors import MeshError, NotOneBodyError
 from datagen.mesh.files import write_posed
-from datagen.mesh.geometries import CHOOSE
 from datagen.mesh.sequences import write_animation
+from workflows.demo.captions import plain
 from workflows.demo.poses import PoseFile, read_poses
-from workflows.demo.transfers import Asked, Outcome, Transfers, read
+from workflows.demo.transfers import Asked, Outcome, Transfers, read, reason_of_failure
 from workflows.demo.uploads import FRAME_LIMIT, keep, keep_poses
 
 Work = TypeVar("Work")
-log = logging.getLogger(__name__)
 
 
 class View(Protocol):
@@ -53,7 +48,7 @@ class Session:
     """One person's meshes, in a folder of their own that goes with them."""
 
     def __init__(self, folder: Path, transfers: Transfers, view: View) -> None:
-        self._folder, self._transfers, self._view = folder, transfers, view
+        self.folder, self._transfers, self._view = folder, transfers, view
         self.outcome: Outcome | None = None
         self._uploads, self._kept = count(1), defaultdict[str, list[Path]](list)
         self._here = threading.Lock()  # held where the folder is written in, so that nothing comes after its end
@@ -77,7 +72,7 @@ class Session:
             return self._keep(role, name, content)
 
     def _keep(self, role: str, name: str, content: bytes) -> tuple[Path, ...]:
-        folder = self._folder / f"{role}-{next(self._uploads)}"
+        folder = self.folder / f"{role}-{next(self._uploads)}"
         try:
             files = keep(name, content, folder, most=1 if role == "target" else FRAME_LIMIT)
             with contextlib.suppress(NotOneBodyError):  # until a person has chosen among its geometries
@@ -100,7 +95,7 @@ class Session:
         """
         with self._here:
             self._require_open()
-            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
+            with tempfile.TemporaryDirectory(dir=self.folder) as folder:
                 return read_poses(keep_poses(name, content, Path(folder) / "poses"))
 
     def result(self, suffix: str) -> Result:
@@ -116,42 +111,31 @@ class Session:
             raise MeshError("nothing is posed yet: choose a source and a target")
         with self._here:
             self._require_open()
-            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
+            with tempfile.TemporaryDirectory(dir=self.folder) as folder:
                 out = Path(folder) / f"{outcome.file.path.stem}-posed{suffix}"
                 left_out = _written(outcome, out)
-                return Result(*_file_or_zip(out), [self.plain(line) for line in left_out])
+                return Result(*_file_or_zip(out), [plain(line, self.folder) for line in left_out])
 
     def close(self) -> None:
         """End the work and remove the folder."""
         self._newest.close()
         with self._here:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     def _require_open(self) -> None:
-        if not self._folder.is_dir():
+        if not self.folder.is_dir():
             raise MeshError("this page is closed: load it again")
 
     def _pose(self, asked: Asked, stale: Callable[[], bool]) -> None:
         self._view.posing()
         try:
-            self._transfers.run(asked, self._folder, stale, self._take)
-        except DsffnetError as error:
-            self._view.fail(self.plain(error))
+            self._transfers.run(asked, self.folder, stale, self._take)
         except Exception as error:
-            log.warning("a transfer failed", exc_info=not ran_out_of_memory(error))
-            self._view.fail(
-                "memory ran out: decimate the meshes" if ran_out_of_memory(error) else f"it failed: {error!r}"
-            )
+            self._view.fail(plain(reason_of_failure(error), self.folder))
 
     def _take(self, outcome: Outcome) -> None:
         self.outcome = outcome
         self._view.show(outcome)
-
-    def plain(self, error: object) -> str:
-        """A message in which files are called by their names, not by where they lie."""
-        text = re.sub(rf"{re.escape(str(self._folder))}/([\w-]+/)*", "", str(error))
-        plain = text.replace("look at --picture", "look at it").replace(f"Choose with {CHOOSE}", "Choose among them")
-        return printable(plain)
 
 
 def _written(outcome: Outcome, out: Path) -> list[str]:

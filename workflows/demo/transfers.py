@@ -1,6 +1,7 @@
 """One transfer for the page, by the functions of ``dsffnet transfer``: files in, what the page shows out."""
 
 import argparse
+import logging
 import shutil
 import tempfile
 import threading
@@ -12,22 +13,25 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from datagen.common.arrays import Floats
-from datagen.common.errors import MeshError, RecipeError
+from datagen.common.errors import DsffnetError, MeshError, RecipeError
+from datagen.common.resources import ran_out_of_memory
 from datagen.mesh.files import MeshFile, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh, bounding_box
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import recentred_point_mesh_distance
-from workflows.demo.bodies import Figure, mesh_of, random_figure, truth_of, walk
+from workflows.demo.bodies import Figure, garments_of, mesh_of, random_figure, truth_of, walk
 from workflows.demo.poses import PERSON
-from workflows.demo.uploads import VERTEX_LIMIT
+from workflows.demo.uploads import FRAME_LIMIT, VERTEX_LIMIT
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
 
+log = logging.getLogger(__name__)
 Body = Figure | tuple[Path, ...]
 """A made-up body, or the files of an upload: one mesh, or frames."""
 MOTION_LIMIT = 5_000_000
@@ -49,6 +53,7 @@ class Switches:
     fps: float = 15.0
     source_geometry: tuple[str, ...] = ()
     target_geometry: tuple[str, ...] = ()
+    animation: str | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,11 @@ class Posed:
 
 @dataclass
 class Outcome:
-    """A transfer as far as it has come: frames, and how many there will be."""
+    """A transfer as far as it has come: frames, and how many there will be.
+
+    ``garments`` [v]: of a made-up target in clothes, what each vertex belongs to; ``no_truth``: why the truth, which
+    was asked for, cannot be had.
+    """
 
     asked: Asked
     file: MeshFile
@@ -97,12 +106,15 @@ class Outcome:
     count: int
     weights: str
     warnings: list[str]
+    garments: NDArray[np.integer] | None = None
     seconds: float = 0.0
+    no_truth: str = ""
 
     @property
     def waits_for_draping(self) -> bool:
         """Whether it has no errors yet, which draping would tell."""
-        return self.asked.needs_draping and not self.asked.moving and self.frames[0].errors is None
+        is_open = self.frames[0].errors is None and not self.no_truth
+        return is_open and self.asked.needs_draping and not self.asked.moving
 
 
 class _Remembering(PoseTransfer):
@@ -150,8 +162,9 @@ class Transfers:
         DsffnetError
             As ``dsffnet transfer``, and a mesh of more than VERTEX_LIMIT vertices.
         """
-        sources = _files_of(asked.source, folder / "source", moving=asked.moving)
-        target = _files_of(asked.target, folder / "target", moving=False)[0]
+        switches = asked.switches
+        sources = _files_of(asked.source, folder / "source", moving=asked.moving, animation=switches.animation)
+        target = _files_of(asked.target, folder / "target")[0]
         job = _job(asked, sources, target, folder, named=self.weights is not None)
         with _ONE_AT_A_TIME:
             for outcome in self._outcomes(asked, job):
@@ -161,17 +174,18 @@ class Transfers:
 
     def _outcomes(self, asked: Asked, job: TransferJob) -> Iterator[Outcome]:
         began, warnings = time.perf_counter(), list[str]()
-        first, target = read(job.sources[0], job.source_geometry), read(job.target, job.target_geometry)
+        first, target = within_limit(job.read_source(0)), within_limit(job.read_target())
         work = TransferWork.of(
             job, self.weights, first=first.mesh, target=target, force=asked.switches.force, load=self._load,
             warn=warnings.append,
         )  # fmt: skip
-        outcome = Outcome(asked, target, [], len(job.sources), work.by or str(self.weights), warnings)
+        garments = garments_of(asked.target) if isinstance(asked.target, Figure) else None
+        outcome = Outcome(asked, target, [], job.count, work.by or str(self.weights), warnings, garments)
         figures = _figures(asked)
         require_room(outcome.count, first.mesh, target.mesh)
         stood = _turned(work.axes[1], target.mesh)
         for number, posed in enumerate(work.posed()):
-            mesh = read(job.sources[number], job.source_geometry).mesh if number else first.mesh
+            mesh = within_limit(job.read_source(number)).mesh if number else first.mesh
             if np.array_equal(mesh.faces, first.mesh.faces):
                 mesh = Mesh(mesh.vertices, first.mesh.faces)
             frame = Posed(_turned(work.axes[0], mesh), stood, _turned(work.axes[1], posed), posed)
@@ -182,8 +196,21 @@ class Transfers:
             yield outcome
         if asked.draped and asked.needs_draping and not asked.moving:  # what takes longer comes after the result
             assert isinstance(asked.target, Figure)
-            outcome.frames[0] = _measured(outcome.frames[0], truth_of(figures[0], asked.target))
+            try:
+                outcome.frames[0] = _measured(outcome.frames[0], truth_of(figures[0], asked.target))
+            except Exception as error:  # the result is there all the same
+                outcome.no_truth = f"The truth could not be draped: {reason_of_failure(error)}"
             yield outcome
+
+
+def reason_of_failure(error: Exception) -> str:
+    """What a person is told; what nobody foresaw goes into the log whole."""
+    if isinstance(error, DsffnetError):
+        return str(error)
+    if ran_out_of_memory(error):
+        return "memory ran out: decimate the meshes"
+    log.warning("a transfer failed", exc_info=error)
+    return f"it failed: {error!r}"
 
 
 def _figures(asked: Asked) -> list[Figure]:
@@ -192,11 +219,13 @@ def _figures(asked: Asked) -> list[Figure]:
     return walk(asked.source) if asked.moving else [asked.source]
 
 
-def _files_of(body: Body, folder: Path, *, moving: bool) -> list[Path]:
+def _files_of(body: Body, folder: Path, *, moving: bool = False, animation: str | None = None) -> list[Path]:
     """The files of a body; those of a figure are written, in the place of the last one's."""
     if not isinstance(body, Figure):
-        if moving and len(body) == 1:
-            raise MeshError(f"{body[0].name} is one mesh: frames to play come as a .zip of mesh files")
+        if moving and len(body) == 1 and not animation:
+            raise MeshError(
+                f"{body[0].name} is one mesh: frames to play come as a .zip of mesh files, or as an animated .glb"
+            )
         return list(body) if moving else [body[0]]
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -209,11 +238,15 @@ def _files_of(body: Body, folder: Path, *, moving: bool) -> list[Path]:
 
 def read(path: Path, geometries: Sequence[str] = ()) -> MeshFile:
     """As ``dsffnet transfer`` reads it; MeshError also where it has more vertices than the page takes."""
-    file = read_mesh_file(path, geometries=geometries)
+    return within_limit(read_mesh_file(path, geometries=geometries))
+
+
+def within_limit(file: MeshFile) -> MeshFile:
+    """The file; MeshError where it has more vertices than the page takes."""
     if len(file.mesh.vertices) > VERTEX_LIMIT:
         raise MeshError(
-            f"{path} has {len(file.mesh.vertices):,} vertices, the page takes {VERTEX_LIMIT:,}: decimate it, or use "
-            "dsffnet transfer"
+            f"{file.path} has {len(file.mesh.vertices):,} vertices, the page takes {VERTEX_LIMIT:,}: decimate it, or "
+            "use dsffnet transfer"
         )
     return file
 
@@ -231,6 +264,7 @@ def _job(asked: Asked, sources: list[Path], target: Path, folder: Path, *, named
         options.align = options.align and not all(made_up)
     if not asked.moving:
         options.smooth = "0"
+    if not asked.moving or options.animation:
         return TransferJob.from_options(options)
     options.paths[0] = str(sources[0].parent)
     return replace(TransferJob.from_options(options), sources=sources)
@@ -253,8 +287,12 @@ def require_room(frames: int, source: Mesh, target: Mesh) -> None:
     Raises
     ------
     MeshError
-        Its frames have more than MOTION_LIMIT vertices in all, of source and of target.
+        It has more than FRAME_LIMIT frames, or these more than MOTION_LIMIT vertices in all, of source and of target.
     """
+    if frames > FRAME_LIMIT:
+        raise MeshError(
+            f"{frames:,} frames, the page plays {FRAME_LIMIT:,}: cut the animation, or use dsffnet transfer"
+        )
     vertices = len(source.vertices) + len(target.vertices)
     if frames > 1 and frames * vertices > MOTION_LIMIT:
         raise MeshError(

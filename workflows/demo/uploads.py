@@ -28,7 +28,8 @@ POSES = ".npz"
 _BESIDE = (".mtl", ".png", ".jpg", ".jpeg")  # of an OBJ or PLY
 _LONGEST_NAME, _DEEPEST = 60, 8
 _UNREADABLE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, OSError, EOFError, ValueError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, ValueError,
+    RuntimeError,  # of one with a password; its NotImplementedError of a compression that Python does not know
 )  # fmt: skip
 
 

@@ -12,17 +12,10 @@ from datagen.characters.motion import Motion, animation_names
 from datagen.common.errors import BodyError, DsffnetError, MeshError
 from datagen.mesh.files import read_mesh_file
 from datagen.mesh.sequences import write_animation
-from tests.support.shapes.rigged_files import Document, Rig, about, quaternion
+from tests.support.shapes.rigged_files import Document, Rig, about, nodding, quaternion
 
 SECOND, NONE = [0.0, 1.0], np.eye(3)
 _HALF = 0.5**0.5  # of a unit square's diagonal
-
-
-def nodding(path: Path, **options: Any) -> Path:
-    rig = Rig(**options)
-    rig.clips["Nod"] = {"Neck": rig.keys("Neck", [NONE, about("x", 60)], SECOND)}
-    rig.clips["Kick"] = {"Leg.L": rig.keys("Leg.L", [NONE, about("x", -90)], [0.0, 0.5])}
-    return rig.save(path)
 
 
 def motion(path: Path, animation: str, fps: float = 4.0) -> Motion:

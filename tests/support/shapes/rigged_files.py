@@ -231,3 +231,11 @@ def quaternion(rotation: Floats) -> list[float]:
 def about(axis: str, degrees: float) -> Floats:
     """A rotation [3, 3] about an axis of the coordinates."""
     return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+
+def nodding(path: Path, **options: Any) -> Path:
+    """A small person with two animations: "Nod" of a second, "Kick" of half a second."""
+    rig, still = Rig(**options), np.eye(3)
+    rig.clips["Nod"] = {"Neck": rig.keys("Neck", [still, about("x", 60)], [0.0, 1.0])}
+    rig.clips["Kick"] = {"Leg.L": rig.keys("Leg.L", [still, about("x", -90)], [0.0, 0.5])}
+    return rig.save(path)

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 import viser
 
+from tests.support.shapes.rigged_files import nodding
 from workflows.demo.file_controls import MeshFileControls
 from workflows.demo.pose_controls import JointControls, PoseControls
 from workflows.demo.poses import Pose, read_poses
@@ -44,7 +45,7 @@ def test_poses_are_those_of_the_file_as_long_as_it_is_chosen(gui: viser.GuiApi, 
         return read_poses(tmp_path / name)
 
     failures = list[str]()
-    controls = PoseControls(gui, Pose(7.0), keep=keep, changed=lambda: None, failed=failures.append)
+    controls = PoseControls(gui, Pose(7.0), is_source=True, keep=keep, changed=lambda: None, failed=failures.append)
     controls._from.value = "my own (.npz)"
     assert controls.pose == Pose(7.0)  # until there is a file
     written = io.BytesIO()
@@ -81,7 +82,9 @@ def mesh_controls(gui: viser.GuiApi, tmp_path: Path) -> tuple[MeshFileControls, 
         return (tmp_path / name,)
 
     failures = list[str]()
-    made = MeshFileControls(gui, "meshes", accepted=".glb", keep=keep, changed=lambda: None, failed=failures.append)
+    made = MeshFileControls(
+        gui, "meshes", accepted=".glb", keep=keep, changed=lambda: None, failed=failures.append, plays=True
+    )
     return made, failures
 
 
@@ -106,3 +109,23 @@ def test_geometries_apart_wait_for_a_choice(mesh_controls: tuple[MeshFileControl
     assert controls.files and controls.geometries == ("body",)
     controls._boxes["lamp"].value = True
     assert controls.geometries == ("body", "lamp")  # both are named, else they would be refused
+
+
+def test_animations_of_a_source_are_offered_and_the_first_is_played(
+    mesh_controls: tuple[MeshFileControls, list[str]], gui: viser.GuiApi, tmp_path: Path
+) -> None:
+    controls, failures = mesh_controls
+    content = nodding(tmp_path / "made.glb").read_bytes()
+    controls._receive(SimpleNamespace(name="a.glb", content=content))  # type: ignore[arg-type]
+    assert controls.animation == "Nod" and not failures
+    controls._animation.value = "Kick"  # type: ignore[union-attr]
+    assert controls.animation == "Kick"
+    controls._animation.value = "none: at rest"  # type: ignore[union-attr]
+    assert controls.animation is None
+    controls._receive(SimpleNamespace(name="ball.glb", content=solids(ball=0.0)))  # type: ignore[arg-type]
+    assert controls.animation is None and controls._animation is None
+    target = MeshFileControls(
+        gui, "", accepted=".glb", keep=controls._keep, changed=lambda: None, failed=failures.append, plays=False
+    )
+    target._receive(SimpleNamespace(name="a.glb", content=content))  # type: ignore[arg-type]
+    assert target.files and target.animation is None

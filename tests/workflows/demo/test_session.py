@@ -15,14 +15,20 @@ import pytest
 import trimesh
 
 from datagen.bodies import load_body
+from datagen.characters.motion import Motion
 from datagen.common.errors import MeshError
 from datagen.mesh.files import load_mesh, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.sequences import write_animation
 from datagen.poses import draw_poses
 from datagen.recipe import LegBody, PoseRecipe, RangePoses
+from tests.support.shapes.rigged_files import nodding
+from training.inference.domain_check import remarks
 from training.inference.orientation import Axes
+from training.inference.standing import Standing
 from workflows.cli import main as cli
 from workflows.demo.bodies import Figure
+from workflows.demo.captions import label, legend, plain
 from workflows.demo.poses import PERSON, Pose
 from workflows.demo.session import Newest, Session
 from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of, require_room
@@ -151,12 +157,70 @@ def test_frames_come_one_after_the_other_and_go_into_one_animation(
     assert name == "leg0-posed.glb" and b'"animations"' in content
 
 
+@pytest.mark.parametrize("kind", ["joints", "morph targets"])
+def test_an_animation_of_a_source_is_played_as_the_command_poses_it(
+    kind: str, session: Session, view: Seen, legs: list[Path], tmp_path: Path
+) -> None:
+    walk = tmp_path / "walk.glb"
+    if kind == "joints":
+        nodding(walk)
+    else:
+        leg = read_mesh_file(legs[0])
+        write_animation(leg, [load_mesh(path).vertices for path in legs], walk, frames_per_second=15)
+    animation, frames = ("Nod", 16) if kind == "joints" else ("poses", 3)
+    source, target = upload(session, "source", walk), upload(session, "target", legs[0])
+    session.ask(Asked(source, target, replace(STANDING, force=True, animation=animation), moving=True))
+    view.wait()
+    assert not view.failures and [outcome.count for outcome in view.frames] == [frames] * frames
+    shown = view.frames[-1].frames
+    assert np.ptp([frame.source.vertices for frame in shown], axis=0).max() > 0.05
+    out = tmp_path / "posed.glb"
+    options = ["--model", "human", "--up", "Y", "--front", "Z", "--animation", animation, "--fps", "15"]
+    cli.main(["transfer", str(walk), str(legs[0]), "-o", str(out), *options])
+    posed = Motion.of(read_mesh_file(out), "poses", frames_per_second=15)
+    assert posed.count == frames
+    for number, frame in enumerate(shown):
+        assert np.allclose(posed.mesh(number).vertices, frame.posed.vertices, atol=1e-4)
+    session.ask(Asked(source, target, replace(STANDING, force=True)))
+    view.wait()
+    assert view.frames[-1].count == 1
+
+
+def test_an_animation_longer_than_the_page_plays_is_refused(
+    session: Session, view: Seen, legs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workflows.demo.transfers.FRAME_LIMIT", 15)
+    source, target = upload(session, "source", nodding(tmp_path / "walk.glb")), upload(session, "target", legs[0])
+    session.ask(Asked(source, target, replace(STANDING, force=True, animation="Nod"), moving=True))
+    view.wait()
+    assert "16 frames, the page plays 15" in view.failures[0] and not view.frames
+
+
+def test_messages_name_the_controls_of_the_page_and_no_folder_of_the_server(legs: list[Path]) -> None:
+    mesh, way = load_mesh(legs[0]), Standing(np.eye(3), misfit=1.0)
+    name = str(legs[0].parent / "source-1" / "leg.obj")
+    three = Mesh(
+        np.concatenate([mesh.vertices + 9 * place for place in range(3)]),
+        np.concatenate([mesh.faces + len(mesh.vertices) * place for place in range(3)]),
+    )
+    said = remarks(three, name=name, axes=way, way=None, both=None, stated=False, seen=None)
+    lines = [plain(each, legs[0].parent) for each in said]
+    assert lines[0].startswith("leg.obj is unlike") and lines[0].endswith("look at it")
+    assert "choose its geometries" in lines[1]
+    lines += [
+        plain(each, legs[0].parent)
+        for each in ("a is a person and b is an animal; or add --force, to see", "add --align, or --up=Z --front=-Y")
+    ]
+    assert lines[-2:] == ["a is a person and b is an animal; or choose Force, to see", "choose Align, or Up Z Front -Y"]
+    assert not any("--" in line for line in lines)
+
+
 def test_a_broken_file_is_refused_in_one_line_and_the_last_one_stays(session: Session, legs: list[Path]) -> None:
     kept = upload(session, "source", legs[0])
     with pytest.raises(MeshError, match=r"broken\.obj") as refused:
         session.keep("source", "broken.obj", b"v 0 0 0\nf 1 2 9\n")
     assert "\n" not in str(refused.value)
-    assert session.plain(refused.value).startswith("broken.obj")
+    assert plain(refused.value, session.folder).startswith("broken.obj")
     assert kept[0].exists()
 
 
@@ -313,9 +377,7 @@ def test_a_scene_waits_for_a_choice_and_says_where(session: Session, tmp_path: P
     kept = session.keep("target", "two.glb", scene.export(file_type="glb"))
     with pytest.raises(MeshError) as refused:
         read_mesh_file(kept[0])
-    assert session.plain(refused.value).endswith("Choose among them") and "two.glb holds 2" in session.plain(
-        refused.value
-    )
+    assert plain(refused.value, session.folder).endswith("Choose among them")
 
 
 def test_poses_are_read_and_no_file_of_them_stays(session: Session, tmp_path: Path) -> None:
@@ -325,7 +387,7 @@ def test_poses_are_read_and_no_file_of_them_stays(session: Session, tmp_path: Pa
     for name, content in (("walk.npz", b"none"), ("walk.obj", written.getvalue())):
         with pytest.raises(MeshError, match=r"walk\.") as refused:
             session.keep_poses(name, content)
-        assert str(tmp_path) not in session.plain(refused.value)
+        assert str(tmp_path) not in plain(refused.value, session.folder)
     assert not list((tmp_path / "session").iterdir())
 
 
@@ -343,6 +405,7 @@ def test_the_truth_of_clothes_comes_after_the_result_where_it_is_asked(
 
     monkeypatch.setattr("workflows.demo.transfers.mesh_of", mesh_of)
     monkeypatch.setattr("workflows.demo.transfers.truth_of", truth_of)
+    monkeypatch.setattr("workflows.demo.transfers.garments_of", lambda _: None)
     source, target = Figure(PERSON, (0.5,) * 6, Pose(1.0)), Figure(PERSON, (0.5,) * 6, outfit="coat")
     shown = list[tuple[float | None, bool]]()
 
@@ -356,6 +419,27 @@ def test_the_truth_of_clothes_comes_after_the_result_where_it_is_asked(
     assert shown[1] == (None, True) and shown[2][0] and not shown[2][1] and draped == [Pose(1.0)]
     transfers.run(replace(asked, draped=True), tmp_path / "work", lambda: True, show)  # a slider has moved on
     assert len(shown) == 4 and len(draped) == 1
+
+
+def test_a_truth_that_cannot_be_draped_is_said_beside_the_result(
+    legs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transfers: Transfers, view: Seen
+) -> None:
+    def truth_of(source: Figure, target: Figure) -> Mesh:
+        raise MeshError("the cloth is torn")
+
+    monkeypatch.setattr("workflows.demo.transfers.mesh_of", lambda figure: load_mesh(legs[0]))
+    monkeypatch.setattr("workflows.demo.transfers.truth_of", truth_of)
+    monkeypatch.setattr("workflows.demo.transfers.garments_of", lambda _: None)
+    session = Session(tmp_path / "s", transfers, view)
+    source, target = Figure(PERSON, (0.5,) * 6, Pose(1.0)), Figure(PERSON, (0.5,) * 6, outfit="coat")
+    session.ask(Asked(source, target, Switches(force=True), draped=True))
+    view.wait()
+    view.wait()
+    session.close()
+    outcome = session.outcome
+    assert outcome is not None and not view.failures and outcome.frames[0].pmd is None
+    assert "the cloth is torn" in legend(outcome, outcome.frames[0], 1.0, shown=True)
+    assert not label(outcome, outcome.frames[0])
 
 
 def test_a_sequence_of_too_many_vertices_is_refused(legs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:

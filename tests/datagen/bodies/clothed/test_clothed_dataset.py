@@ -14,7 +14,7 @@ import pytest
 from matplotlib.image import imread
 
 from datagen.bodies.clothed.model import ClothedModel
-from datagen.common.errors import DatasetError
+from datagen.common.errors import DatasetError, MeshError
 from datagen.exporters import export_dataset
 from datagen.generate import generate
 from datagen.generate.plan import plan_of
@@ -103,6 +103,16 @@ def test_an_animated_glb_goes_through_the_poses(people: Dataset, tmp_path: Path)
         moves = [file.accessor(its["primitives"][0]["targets"][0]["POSITION"]) for its in file.json["meshes"]]
         second = people.vertices(identity, 0) + np.concatenate(moves)
         assert np.abs(second - people.vertices(identity, 1)).max() < 1e-6
+
+
+def test_an_animation_of_too_many_poses_is_refused_before_any_is_read(
+    people: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("datagen.exporters.FRAME_LIMIT", 2)
+    monkeypatch.setattr(Dataset, "vertices", None)
+    with pytest.raises(MeshError, match="3 poses of an identity are more than 2"):
+        export_dataset(people, tmp_path / "out", layout="glb-animated", identities=[0, 3])
+    assert not (tmp_path / "out").exists()
 
 
 def test_obj_has_a_group_a_part_but_not_for_peers(people: Dataset, tmp_path: Path) -> None:
