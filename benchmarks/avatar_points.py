@@ -19,7 +19,7 @@ from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 
 from datagen.bodies import load_body
-from datagen.bodies.clothed.garments import BODY_VERTICES
+from datagen.bodies.clothed.figure import BODY_VERTICES
 from datagen.bodies.clothed.model import ClothedModel
 from datagen.characters.simplify import simplify
 from datagen.common.arrays import Floats

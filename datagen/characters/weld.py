@@ -38,7 +38,7 @@ def weld(skin: Skin, *, name: str) -> WeldedSkin:
     _require_usable(positions[used], weights[used], name)
     weights[used] /= weights[used].sum(axis=1, keepdims=True)
     alike = np.concatenate([positions, np.round(weights * 1e4)], axis=1)
-    faces = _first_of_equals(alike)[faces]
+    faces = first_of_equals(alike)[faces]
     faces = _without_edges_of_no_length(positions, faces)
     if not len(faces):
         raise BodyError(f"{name} has no face with an area. Export a triangle mesh")
@@ -69,7 +69,7 @@ def _require_usable(positions: NDArray[np.float64], weights: NDArray[np.float64]
         raise BodyError(f"{name} has {len(lost)} vertices that no joint moves. Bind them to a joint, export it again")
 
 
-def _first_of_equals(rows: NDArray[np.float64]) -> NDArray[np.int64]:
+def first_of_equals(rows: NDArray[np.float64]) -> NDArray[np.int64]:
     """For each row the number of the first row that equals it."""
     _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first[group.ravel()]
@@ -82,6 +82,6 @@ def _without_edges_of_no_length(positions: NDArray[np.float64], faces: NDArray[n
     size = (len(positions), len(positions))
     links = scipy.sparse.coo_array((np.ones(len(short)), (short[:, 0], short[:, 1])), shape=size)
     _, group = scipy.sparse.csgraph.connected_components(links, directed=False)
-    faces = _first_of_equals(group[:, None])[faces]
+    faces = first_of_equals(group[:, None])[faces]
     differ = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     return faces[differ]

@@ -69,6 +69,35 @@ def bounding_box(vertices: NDArray[np.floating]) -> Box:
     return Box((low + high) / 2, (high - low).max(axis=-1) / 2)
 
 
+def closest_on_triangle(points: Floats, corners: Floats) -> NDArray[np.float64]:
+    """Barycentric coordinates [..., 3] of the places on triangles [..., 3, 3] that are nearest to points [..., 3].
+
+    That of the plane where it lies within the triangle, and else the nearest of its three sides'.
+    """
+    first, second, third = (corners[..., corner, :] for corner in range(3))
+    along, beside, to = second - first, third - first, points - first
+    aa, ab, bb = (along**2).sum(-1), (along * beside).sum(-1), (beside**2).sum(-1)
+    pa, pb = (to * along).sum(-1), (to * beside).sum(-1)
+    area = np.maximum(aa * bb - ab**2, 1e-30)
+    two, three = (bb * pa - ab * pb) / area, (aa * pb - ab * pa) / area
+    inner = np.stack([1 - two - three, two, three], axis=-1)
+    sides = np.stack([_on_side(points, corners, start) for start in range(3)], axis=-2)
+    places = (sides[..., None] * corners[..., None, :, :]).sum(-2)
+    nearest = ((places - points[..., None, :]) ** 2).sum(-1).argmin(-1)
+    outer = np.take_along_axis(sides, nearest[..., None, None], -2)[..., 0, :]
+    return np.where((inner >= 0).all(-1, keepdims=True), inner, outer)
+
+
+def _on_side(points: Floats, corners: Floats, start: int) -> NDArray[np.float64]:
+    end = (start + 1) % 3
+    side = corners[..., end, :] - corners[..., start, :]
+    along = ((points - corners[..., start, :]) * side).sum(-1) / np.maximum((side**2).sum(-1), 1e-30)
+    share = np.clip(along, 0, 1)
+    found = np.zeros((*share.shape, 3))
+    found[..., start], found[..., end] = 1 - share, share
+    return found
+
+
 def standing_point(vertices: Floats) -> NDArray[np.float64]:
     """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)

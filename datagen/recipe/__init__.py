@@ -13,7 +13,7 @@ from datagen.recipe.bodies import (
     SmalBody,
     SmplBody,
 )
-from datagen.recipe.clothed import OUTFITS, ClothedBody, DrapeSolver, GarmentPart, OwnOutfit
+from datagen.recipe.clothed import OUTFITS, ClothedBody, DrapeSolver, GarmentFile, GarmentPart, OwnOutfit
 from datagen.recipe.dataset import (
     ANIMALS,
     PATH_KEYS,
@@ -45,6 +45,7 @@ __all__ = [
     "FilePoses",
     "FoundPoses",
     "Frozen",
+    "GarmentFile",
     "GarmentPart",
     "Growth",
     "IdentityRecipe",

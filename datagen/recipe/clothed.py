@@ -3,9 +3,9 @@
 from collections import Counter
 from collections.abc import Mapping
 from difflib import get_close_matches
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from datagen.recipe.anny import AnnyBody
 from datagen.recipe.base import BodySection, Frozen, Range
@@ -29,6 +29,11 @@ class GarmentPart(Frozen):
     )
     stiffness: Literal["soft", "normal", "stiff"] = Field("normal", description="how much the cloth resists bending")
 
+    @property
+    def follows(self) -> Literal["tights", "skirt"]:
+        """What it moves with."""
+        return self.group
+
     @model_validator(mode="after")
     def _can_be_cut(self) -> Self:
         if self.high is not None and self.low >= self.high:
@@ -37,6 +42,42 @@ class GarmentPart(Frozen):
             raise ValueError(f"a skirt has no sleeves, but sleeve is {self.sleeve:g}: leave it out, or use tights")
         return self
 
+
+class Wearer(Frozen):
+    """The person of Anny that a garment was made for; each phenotype lies in [0, 1]."""
+
+    gender: float = Field(0.5, ge=0, le=1, description="0 male, 1 female")
+    age: float = Field(0.67, ge=0, le=1, description="0 baby, 1/3 child, 2/3 young adult, 1 old")
+    muscle: float = Field(0.5, ge=0, le=1, description="0 slight, 1 muscular")
+    weight: float = Field(0.5, ge=0, le=1, description="0 thin, 1 heavy")
+    height: float = Field(0.5, ge=0, le=1, description="0 short, 1 tall")
+    proportions: float = Field(0.5, ge=0, le=1, description="0 ideal, 1 uncommon body proportions")
+
+
+class GarmentFile(Frozen):
+    """One part of an outfit from a mesh file, made for a person of Anny in the T-pose: metres, Y up, facing +Z."""
+
+    group: Literal["file"] = Field(description="file: a mesh file of one's own")
+    path: str = Field("", description="the file: OBJ, PLY or GLB. Not part of the dataset's identity: its hash is")
+    geometry: str = Field("", description="which geometry of a GLB, or group of an OBJ; default: the whole file")
+    unit: float = Field(1.0, gt=0, description="metres in one unit of the file: 0.01 for centimetres")
+    follows: Literal["tights", "skirt"] = Field(
+        "tights", description="what it moves with: tights, the body from neck to toe, or skirt, a tube around the legs"
+    )
+    fits: Wearer = Field(default_factory=Wearer, description="the person it was made for")
+    ease: float = Field(0.0, ge=0, le=0.1, description="metres further from the body than it was made")
+    pins: tuple[Literal["top", "sleeves", "hem"], ...] = Field(
+        ("top",), description="borders that keep their place on the body: the highest, those on arms, the others"
+    )
+    stiffness: Literal["soft", "normal", "stiff"] = Field("normal", description="how much the cloth resists bending")
+
+
+def _kind(part: Any) -> str:
+    group = part.get("group") if isinstance(part, Mapping) else getattr(part, "group", None)
+    return "file" if group == "file" else "cut"
+
+
+Part = Annotated[Annotated[GarmentPart, Tag("cut")] | Annotated[GarmentFile, Tag("file")], Discriminator(_kind)]
 
 _TROUSERS, _SHIRT = GarmentPart(low=0.2, high=2.9), GarmentPart(low=1.9, sleeve=1.85, pins=("top", "sleeves"))
 _TUCKED = _SHIRT.model_copy(update={"low": 2.7, "pins": ("top", "sleeves", "hem")})
@@ -71,7 +112,7 @@ class OwnOutfit(Frozen):
     name: str = Field(
         pattern=r"^\w[\w -]*$", max_length=60, description="what `outfits` calls it: letters, digits, spaces, - and _"
     )
-    parts: tuple[GarmentPart, ...] = Field(min_length=1, description="from the innermost to the outermost")
+    parts: tuple[Part, ...] = Field(min_length=1, description="from the innermost to the outermost")
 
 
 class DrapeSolver(Frozen):
@@ -128,9 +169,10 @@ class ClothedBody(BodySection):
             raise ValueError(f"detail ({self.detail}) is more than solver.subdivide ({self.solver.subdivide})")
         return self
 
-    def outfit(self, number: int) -> tuple[GarmentPart, ...]:
+    def outfit(self, number: int) -> tuple[Part, ...]:
         """The parts of an outfit by its number among ``outfits``."""
-        return (OUTFITS | {its.name: its.parts for its in self.own})[self.outfits[number]]
+        own: dict[str, tuple[Part, ...]] = {its.name: its.parts for its in self.own}
+        return (dict(OUTFITS) | own)[self.outfits[number]]
 
     @property
     def worker_bytes(self) -> float:

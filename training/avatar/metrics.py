@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from datagen.common.arrays import Floats, Integers
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, closest_on_triangle
 
 _NEAR = 8  # samples whose triangles may be the nearest
 _MM = 1000.0
@@ -82,7 +82,7 @@ class Surface:
         """
         near = self.faces[self._tree.query(points, min(_NEAR, len(self.points)))[1]].reshape(len(points), -1)
         corners = np.asarray(self.mesh.vertices, np.float64)[self.mesh.faces[near]]
-        shares = _closest_on_triangle(points[:, None], corners)
+        shares = closest_on_triangle(points[:, None], corners)
         away = np.linalg.norm((shares[..., None] * corners).sum(axis=2) - points[:, None], axis=2)
         best = away.argmin(axis=1)[:, None]
         return np.take_along_axis(near, best, 1)[:, 0], np.take_along_axis(shares, best[..., None], 1)[:, 0]
@@ -175,35 +175,6 @@ def footprint_drift(points: Sequence[Floats], scans: Sequence[Mesh], rest: Float
 def _footprints(points: Floats, scan: Mesh, rest: Floats) -> NDArray[np.float64]:
     face, shares = Surface.sampled(scan, 4 * len(scan.faces)).closest(points)
     return (shares[..., None] * np.asarray(rest, np.float64)[scan.faces[face]]).sum(axis=1)
-
-
-def _closest_on_triangle(points: Floats, corners: Floats) -> NDArray[np.float64]:
-    """Barycentric coordinates [..., 3] of the places on triangles [..., 3, 3] that are nearest to points [..., 3].
-
-    That of the plane where it lies within the triangle, and else the nearest of its three sides'.
-    """
-    first, second, third = (corners[..., corner, :] for corner in range(3))
-    along, beside, to = second - first, third - first, points - first
-    aa, ab, bb = (along**2).sum(-1), (along * beside).sum(-1), (beside**2).sum(-1)
-    pa, pb = (to * along).sum(-1), (to * beside).sum(-1)
-    area = np.maximum(aa * bb - ab**2, 1e-30)
-    two, three = (bb * pa - ab * pb) / area, (aa * pb - ab * pa) / area
-    inner = np.stack([1 - two - three, two, three], axis=-1)
-    sides = np.stack([_on_side(points, corners, start) for start in range(3)], axis=-2)
-    places = (sides[..., None] * corners[..., None, :, :]).sum(-2)
-    nearest = ((places - points[..., None, :]) ** 2).sum(-1).argmin(-1)
-    outer = np.take_along_axis(sides, nearest[..., None, None], -2)[..., 0, :]
-    return np.where((inner >= 0).all(-1, keepdims=True), inner, outer)
-
-
-def _on_side(points: Floats, corners: Floats, start: int) -> NDArray[np.float64]:
-    end = (start + 1) % 3
-    side = corners[..., end, :] - corners[..., start, :]
-    along = ((points - corners[..., start, :]) * side).sum(-1) / np.maximum((side**2).sum(-1), 1e-30)
-    share = np.clip(along, 0, 1)
-    found = np.zeros((*share.shape, 3))
-    found[..., start], found[..., end] = 1 - share, share
-    return found
 
 
 def _mean_cosine(one: Surface, other: Surface) -> float:

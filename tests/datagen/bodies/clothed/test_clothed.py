@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from datagen.bodies import load_body, part_labels
 from datagen.bodies.clothed.draping import _nearest_kin, depths
-from datagen.bodies.clothed.garments import Figure, garment_of, helper_quads
+from datagen.bodies.clothed.figure import Figure, helper_quads
+from datagen.bodies.clothed.garments import garment_of
 from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.clothed.surface import borders
 from datagen.bodies.skinning import skin
@@ -71,7 +72,7 @@ def test_a_childs_skirt_does_not_hang_on_its_hands(model: ClothedModel) -> None:
     person = model.person((0.5, 0.3, 0.5, 0.5, 0.5, 0.5, list(OUTFITS).index("skirt"), 1.0))
     waist = np.flatnonzero(person.garment.pinned & (person.garment.part == 2))
     chosen = _nearest_kin(person.garment.rest, waist, person.body, body_faces())
-    arms = Figure(person.body, model._joints)._weight_below("left_shoulder")
+    arms = Figure(person.body, model._joints).weight_below("left_shoulder")
     assert arms[body_faces()[chosen]].max() < 0.5
     middles = person.body.vertices[body_faces()[chosen]].mean(axis=1)
     assert np.linalg.norm(middles - person.garment.rest.vertices[waist], axis=1).max() < 0.08
