@@ -125,13 +125,19 @@ def touch(body: wp.uint64, reach: wp.float32, state: State):
 
 @wp.kernel
 def touch_part(below: wp.uint64, first: int, reach: float, state: State):
-    """The same for the parts below, of which only the outer side is kept to."""
+    """The same for the parts below, of which only the outer side is kept to: away from the body, where it is near.
+
+    Normals of the cloth itself are those of its folds: a bunched hem would carry what lies over it upwards.
+    """
     vertex = first + wp.tid()
     state.under_normal[vertex] = wp.vec3(0.0, 0.0, 0.0)
     found = wp.mesh_query_point_no_sign(below, state.place[vertex], reach)
     if found.result:
+        normal = wp.mesh_eval_face_normal(below, found.face)
+        if wp.length_sq(state.normal[vertex]) > 0.5:
+            normal = state.normal[vertex]
         state.under[vertex] = wp.mesh_eval_position(below, found.face, found.u, found.v)
-        state.under_normal[vertex] = wp.mesh_eval_face_normal(below, found.face)
+        state.under_normal[vertex] = normal
 
 
 @wp.func

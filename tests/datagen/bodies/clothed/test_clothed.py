@@ -78,6 +78,18 @@ def test_a_childs_skirt_does_not_hang_on_its_hands(model: ClothedModel) -> None:
     assert np.linalg.norm(middles - person.garment.rest.vertices[waist], axis=1).max() < 0.08
 
 
+def test_a_childs_skirt_does_not_climb_on_the_shirt_that_bunches_below_its_waist() -> None:
+    solver = {"frames": 8, "substeps": 8, "settle": 0, "subdivide": 1}
+    recipe = {"body": ALL_AGES.model_dump(), "outfits": ["skirt"], "detail": 1, "solver": solver}
+    body = load_body(ClothedBody.model_validate(recipe))
+    assert isinstance(body, ClothedModel)
+    parameters, still = np.array([0.5, 0.3, 0.5, 0.5, 0.5, 0.5, 0, 1.0]), np.zeros((1, len(JOINTS), 3))
+    draped = body.vertices(parameters, Poses(JOINTS, PARENTS, still))[0, body.part_labels(parameters) == 2]
+    garment = body.person(tuple(parameters)).garment
+    waist = garment.rest.vertices[garment.pinned & (garment.part == 2), 1]
+    assert draped[:, 1].max() < waist.max() + 0.005
+
+
 def test_skin_under_clothes_is_not_kept_and_labels_say_what_is_what(model: ClothedModel) -> None:
     bare = load_body(ALL_AGES)
     for number in range(5):
