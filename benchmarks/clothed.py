@@ -2,11 +2,13 @@
 
 python -m benchmarks.clothed picture docs/images/bodies-clothed.png
 python -m benchmarks.clothed sheet docs/images/clothed-people.png --identities 6 --poses 1 --subdivide 0
+python -m benchmarks.clothed people FOLDER --identities 50 --poses 20 --subdivide 0   # again: goes on
 python -m benchmarks.clothed walk docs/images/clothed-walk.gif
 python -m benchmarks.clothed measure [--outfits coat] [--identities 3] [--poses 4] [--subdivide 0]
 """
 
 import argparse
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from PIL import Image
 from datagen.bodies.clothed.draping import depths
 from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.skinning import skin
+from datagen.common.files import write_atomically
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, edges_of
 from datagen.mesh.parts import part_colors
@@ -79,6 +82,47 @@ def sheet(path: Path, people: int, poses: int, subdivide: int) -> None:
     columns = [f"{outfit}, {pose}" for outfit in OUTFITS for pose in range(poses)]
     title = f"{people} random people of all ages in every outfit, in NPT's first poses, draped"
     mesh_grid(rows, path, columns=columns, title=title, one_scale=False, size=(150, 150))
+
+
+def people(folder: Path, count: int, poses: int, subdivide: int) -> None:
+    """Random people of all ages, each in every outfit and pose: a picture and figures a person, which are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    body = AnnyBody(topology="notoes_collapse5pc", phenotypes=PhenotypeRanges(age=(0, 1)))
+    model = ClothedModel(ClothedBody(body=body, detail=subdivide, solver=DrapeSolver(subdivide=subdivide)))
+    drawn, begun = draw_poses(PoseRecipe(), range(poses)), time.time()
+    missing = [identity for identity in range(count) if not (folder / f"person-{identity:03d}.json").exists()]
+    for made, identity in enumerate(missing, 1):
+        _person(model, identity, drawn, folder / f"person-{identity:03d}")
+        left = (len(missing) - made) * (time.time() - begun) / made
+        print(f"person {identity}: {made} of {len(missing)}, {left / 60:.0f} minutes left", flush=True)
+    found = [json.loads(path.read_text()) for path in sorted(folder.glob("person-*.json"))]
+    deep, stretch = (np.array([its[key] for its in found]) for key in ("deep", "stretch"))
+    print(f"{len(found)} people, {deep.size} poses, {sum(its['seconds'] for its in found):.0f} CPU s, all finite")
+    for outfit, inside, longer in zip(OUTFITS, deep.transpose(1, 0, 2), stretch.transpose(1, 0, 2), strict=True):
+        print(f"{outfit} | {np.median(inside):.2%}, {inside.max():.2%} | {np.median(longer):.2f}, {longer.max():.2f}")
+
+
+def _person(model: ClothedModel, identity: int, poses: Poses, path: Path) -> None:
+    """Write a person's picture and, for each outfit and pose, the share deeper than 2 mm and p99 of the stretch."""
+    begun, rows = time.process_time(), []
+    deep, stretch = np.zeros((2, len(OUTFITS), len(poses)))
+    drawn = model.draw_identity(generator(1, Stream.IDENTITY, identity), identity)
+    for number, outfit in enumerate(OUTFITS):
+        parameters = np.array([*drawn[:-2], number, drawn[-1]])
+        person, posed = model.person(tuple(parameters.tolist())), model.vertices(parameters, poses)
+        assert np.isfinite(posed).all(), (identity, outfit)
+        first, edges, bodies = len(person.skin.vertices), edges_of(person.garment.faces), model.world_rotations(poses)
+        for pose, body in enumerate(skin(person.body, bodies)):
+            deep[number, pose] = np.mean(depths(posed[pose, first:], body, body_faces()) > 0.002)
+            longer = _lengths(posed[pose, first:], edges) / person.garment.lengths(edges)
+            stretch[number, pose] = np.percentile(longer, 99)
+        faces, colors = model.faces(parameters), part_colors(model.part_labels(parameters)) / 255
+        rows.append(Row(outfit, [Panel(Mesh(standing(one), faces), colors) for one in posed]))
+    title = f"person {identity}, age {drawn[model.parameter_names.index('age')]:.2f}"
+    columns = [str(pose) for pose in range(len(poses))]
+    mesh_grid(rows, path.with_suffix(".png"), columns=columns, title=title, one_scale=False, size=(96, 110))
+    found = {"seconds": time.process_time() - begun, "deep": deep.tolist(), "stretch": stretch.tolist()}
+    write_atomically(path.with_suffix(".json"), json.dumps(found).encode())
 
 
 def walk(path: Path, frames: int = 20) -> None:
@@ -169,7 +213,7 @@ def _apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["picture", "sheet", "walk", "measure"])
+    parser.add_argument("what", choices=["picture", "sheet", "people", "walk", "measure"])
     parser.add_argument("path", nargs="?", type=Path, default=Path("docs/images/bodies-clothed.png"))
     parser.add_argument("--identities", type=int, default=3)
     parser.add_argument("--poses", type=int, default=4)
@@ -180,6 +224,8 @@ if __name__ == "__main__":
         picture(given.path)
     elif given.what == "sheet":
         sheet(given.path, given.identities, given.poses, given.subdivide)
+    elif given.what == "people":
+        people(given.path, given.identities, given.poses, given.subdivide)
     elif given.what == "walk":
         walk(given.path)
     else:
