@@ -29,7 +29,7 @@ from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, ClothedBody, PoseRecipe
 from training.avatar.maps import PositionMaps, Views
 from training.avatar.metrics import Surface, footprint_drift, score
-from training.networks.avatar import Avatar, PointAvatar, Template
+from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges, Scan, avatar_loss
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 from training.viz.render.lighting import vertex_normals
@@ -116,7 +116,7 @@ class Subject:
         places = views.places(data.template)[..., :2]
         own = [torch.from_numpy(np.asarray(its, np.float32)) for its in (data.template, normals, data.weights, places)]
         torch.manual_seed(0)
-        self.network = PointAvatar([Template(*own)], normalisation=normalisation, **_SIZES)
+        self.network = PointAvatar([CanonicalPoints(*own)], normalisation=normalisation, **_SIZES)
         self._edges = Edges.of(data.template_faces, len(data.template))
         self._maps = PositionMaps(views, template, weights, size=_SIZES["map_size"])
 

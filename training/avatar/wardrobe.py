@@ -15,8 +15,7 @@ from training.avatar.maps import PositionMaps, Views
 from training.avatar.outfit import Outfit
 from training.avatar.subject import Subject
 from training.avatar.template import Template
-from training.networks.avatar import Avatar, PointAvatar
-from training.networks.avatar import Template as Points
+from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges
 from training.recipes.networks import AvatarRecipe
 
@@ -89,7 +88,7 @@ class Wardrobe:
         for template in self.templates:
             places = self.views.places(template.vertices.double().numpy())[..., :2]
             points.append(
-                Points(template.vertices, template.normals, template.weights, torch.from_numpy(places).float())
+                CanonicalPoints(template.vertices, template.normals, template.weights, torch.from_numpy(places).float())
             )
         return PointAvatar(points, **self.recipe.sizes())
 

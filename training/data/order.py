@@ -113,7 +113,7 @@ def order_of(recipe: TrainingRecipe, dataset: Dataset) -> "TripleOrder":
 
 def last_step_of(recipe: TrainingRecipe, dataset: Dataset) -> int:
     """The step at which a training of this recipe on this dataset ends, unless early stopping ends it before."""
-    return recipe.steps or recipe.epochs * order_of(recipe, dataset).steps_per_epoch
+    return recipe.last_step(order_of(recipe, dataset).steps_per_epoch)
 
 
 @dataclass(frozen=True)

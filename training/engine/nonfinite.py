@@ -17,20 +17,21 @@ from training.engine.distributed import Ranks, gathered
 log = logging.getLogger(__name__)
 NOT_FINITE = "not-finite.json"
 RecentStep = tuple[int, Any, Any]
-"""A step, its parts of triples, its loss."""
+"""A step, its parts of examples, its loss."""
 
 
 @dataclass(frozen=True)
 class Broken:
-    """What a rank knows of its first step that was not finite: 0 if it had none, and then no triples.
+    """What a rank knows of its first step that was not finite: 0 if it had none, and then no examples.
 
-    ``triples``: rows (source identity, source pose, target identity, target pose).
+    ``examples``: their numbers, a row each; of transfer (source identity, source pose, target identity, target pose),
+    of an avatar (outfit, frame).
     """
 
     rank: int
     step: int
     what: Literal["loss", "gradient"]
-    triples: list[list[int]]
+    examples: list[list[int]]
 
 
 def broken_step(bad_step: int, recent: Sequence[RecentStep], rank: int) -> Broken:
@@ -58,7 +59,7 @@ def stop_for(mine: Broken, run: Path, ranks: Ranks) -> None:
     culprits = [each for each in at_fault if each.what == "loss"] or at_fault
     kept = _written(run, step, culprits) if ranks.rank == 0 else f" (see {run / NOT_FINITE})"
     here = mine in culprits
-    where = f"this rank's triples were {mine.triples}" if here else "on another rank"
+    where = f"this rank's examples were {mine.examples}" if here else "on another rank"
     if culprits[0].what == "gradient":
         where = f"in the gradient only; {where}"
     raise TrainingError(

@@ -42,14 +42,14 @@ class Job:
     @property
     def last_step(self) -> int:
         """The step at which it ends, unless early stopping ends it before."""
-        return self.recipe.steps or self.recipe.epochs * self.order.steps_per_epoch
+        return self.recipe.last_step(self.order.steps_per_epoch)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an evaluation means for the run: the best PMD so far, evaluations since then, whether this was it.
+    """What an evaluation means for the run: the least measure so far, evaluations since then, whether this was it.
 
-    ``triples``: of how many triples of each pose type the PMD is a mean.
+    ``triples``: of how many triples of each pose type it is a mean, in trainings of transfer.
     """
 
     best: float = float("inf")
@@ -57,10 +57,10 @@ class Verdict:
     improved: bool = False
     triples: int | None = None
 
-    def after(self, pmd: float) -> "Verdict":
+    def after(self, measure: float) -> "Verdict":
         """The verdict after one more evaluation."""
-        if pmd < self.best:
-            return replace(self, best=pmd, since=0, improved=True)
+        if measure < self.best:
+            return replace(self, best=measure, since=0, improved=True)
         return replace(self, since=self.since + 1, improved=False)
 
     @classmethod
@@ -78,7 +78,7 @@ class Verdict:
             raise ValueError(f"no verdict: {fault_in(error)}") from error
         if found.triples in (None, triples):
             return replace(found, triples=triples)
-        log.info("evaluate_triples was %s and is %s: the best PMD so far is forgotten", found.triples, triples)
+        log.info("evaluate_triples was %s and is %s: the best measure so far is forgotten", found.triples, triples)
         return cls(triples=triples)
 
     def gives_up(self, patience: int | None) -> bool:

@@ -1,8 +1,8 @@
 """The training loop, the same under any launcher; reads only RANK, WORLD_SIZE, LOCAL_RANK, MASTER_*.
 
 Read top to bottom: ``train`` -> ``_learn``, the loop -> ``_check``, ``_settle``, ``_save``; a step itself is in
-:mod:`training.engine.train_step`. Everything that varies is in the recipe; the order of triples is a function of (seed,
-step), so the state of a run is its weights, its optimiser, the average of its weights and a few numbers.
+:mod:`training.engine.train_step`. Everything that varies is in the recipe; the order of examples is a function of
+(seed, step), so the state of a run is its weights, its optimiser, the average of its weights and a few numbers.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ _LESS_MEMORY = (
 class StopReason(Enum):
     """Why a training ends before its last step."""
 
-    EARLY_STOPPING = "no better PMD for as many evaluations as the recipe says: the training is finished"
+    EARLY_STOPPING = "no better measure in as many evaluations as the recipe says: the training is finished"
     TOLD = "SIGTERM, or the file RUN/stop"
     BUDGET = "the time budget of this command is spent"
 
@@ -145,7 +145,7 @@ def _learn(job: Job, device: torch.device, stop: StopRequest, newest: Checkpoint
         observer = agreed(
             ranks,
             lambda: around.enter_context(observing(job, state.learner, meter, feed.where)) if ranks.rank == 0 else None,
-            what="open the run's journal and evaluation triples",
+            what="open the run's journal and what is measured",
         )
         (told,) = any_rank([stop.made()], ranks)  # while meshes were decoded
         reason = StopReason.TOLD if told else None
@@ -183,11 +183,11 @@ def _settle(
     """Do what is due after a step; return the reason to stop, which may be early stopping now."""
     if due.log:
         shared = mean_over_ranks(values, job.ranks)
-        pmd = decided_by_first(
+        measure = decided_by_first(
             job.ranks, lambda: observer.log(state, shared, validate=due.validate) if observer else None
         )
-        if pmd is not None:
-            state.verdict = state.verdict.after(pmd)
+        if measure is not None:
+            state.verdict = state.verdict.after(measure)
             reason = StopReason.EARLY_STOPPING if state.verdict.gives_up(job.recipe.early_stopping) else reason
     if due.picture and observer:
         observer.draw(state, job.run)

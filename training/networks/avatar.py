@@ -31,8 +31,8 @@ _CORRECTION, _DISPLACEMENT = 0.005, 0.01  # metres for an output of one
 _FEATURES = 0.01  # deviation of the points' features at first
 
 
-class Template(NamedTuple):
-    """The canonical points of an outfit.
+class CanonicalPoints(NamedTuple):
+    """The canonical points of an outfit, the vertices of its template.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class PointAvatar(nn.Module):
 
     def __init__(
         self,
-        templates: Sequence[Template],
+        templates: Sequence[CanonicalPoints],
         *,
         map_size: int = 256,
         unet_width: int = 16,
@@ -219,7 +219,7 @@ def _hidden(before: int, after: int, normalisation: str) -> nn.Sequential:
     return nn.Sequential(nn.Linear(before, after), normalised(after, normalisation), nn.Softplus())
 
 
-def _check_templates(templates: Sequence[Template]) -> None:
+def _check_templates(templates: Sequence[CanonicalPoints]) -> None:
     if not templates:
         raise ValueError("an avatar needs a template: there is none")
     bones = templates[0].weights.shape[-1]

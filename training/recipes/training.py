@@ -176,7 +176,9 @@ class TrainingRecipe(Frozen):
         description="decay of an exponential moving average of the weights (EMA), which is then evaluated",
     )
     early_stopping: int | None = Field(
-        None, ge=1, description="evaluations without a better PMD on unseen poses after which training ends"
+        None,
+        ge=1,
+        description="evaluations without a better measure (of transfer: PMD on unseen poses) after which training ends",
     )
     augmentation: AugmentationRecipe = Field(default_factory=AugmentationRecipe)
     seed: int = Field(0, ge=0, description="seed of the weights and of the order of triples")
@@ -202,7 +204,7 @@ class TrainingRecipe(Frozen):
         "many as memory has room for; auto: device where they fit",
     )
     log_every: int = Field(20, ge=1, description="steps between lines of metrics.jsonl")
-    evaluate_every: int = Field(500, ge=1, description="steps between PMD measurements on a fixed evaluation subset")
+    evaluate_every: int = Field(500, ge=1, description="steps between measurements on a fixed evaluation subset")
     evaluate_triples: int = Field(32, ge=1, description="triples of each pose type in that subset")
     picture_every: int | None = Field(None, ge=1, description="steps between pictures of a few fixed transfers")
     checkpoint_every: int = Field(500, ge=1, description="steps between checkpoints")
@@ -290,6 +292,10 @@ class TrainingRecipe(Frozen):
             raise ValueError(
                 f"network.normalisation 'batch' would be each rank's own, but ranks is {self.ranks}: use 'group'"
             )
+
+    def last_step(self, steps_per_epoch: int) -> int:
+        """The step at which a training ends, unless early stopping ends it before."""
+        return self.steps or self.epochs * steps_per_epoch
 
     def require_same_learning(self, other: "TrainingRecipe", *, where: str, section: str = "training") -> None:
         """Raise if a run that is to be resumed was trained by another recipe.

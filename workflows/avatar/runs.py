@@ -8,7 +8,6 @@ from training.checkpoints.checkpoint import is_finished, load_checkpoint, requir
 from training.checkpoints.weights import fill_network
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
-from training.engine.tasks.protocol import Task
 from training.engine.tasks.registry import task_of
 from training.recipes.training import TrainingRecipe
 from training.tracking.provenance import write_run_head
@@ -28,7 +27,7 @@ def learn(recipe: TrainingRecipe, data: Path, run: RunFolder, *, parent: Path, t
         It ended before the last step.
     """
     task, parameters = task_of(recipe, str(data)), recipe.model_dump(mode="json")
-    steps = last_step(recipe, task)
+    steps = recipe.last_step(task.order.steps_per_epoch)
     with run.alone(), recorded(run.path, kind="train", name=name, parent=parent, parameters=parameters):
         update_record(run.path, artifacts=["recipe.yaml", "provenance.json"])
         write_run_head(run.path, parameters, dataset={"name": data.name, "uuid": task.uuid})
@@ -43,18 +42,14 @@ def learn(recipe: TrainingRecipe, data: Path, run: RunFolder, *, parent: Path, t
         update_record(run.path, artifacts=["recipe.yaml", "provenance.json", "metrics.jsonl"])
 
 
-def last_step(recipe: TrainingRecipe, task: Task) -> int:
-    """The step at which a training ends."""
-    return recipe.steps or recipe.epochs * task.order.steps_per_epoch
-
-
 def is_learned(recipe: TrainingRecipe, data: Path, run: RunFolder) -> bool:
     """Whether a run holds a sound checkpoint of the end of this recipe's training on these data."""
     try:
         task, found = task_of(recipe, str(data)), load_checkpoint(run.path)
     except CheckpointError:
         return False
-    return found is not None and found.dataset == task.uuid and is_finished(found, last_step(recipe, task))
+    last = recipe.last_step(task.order.steps_per_epoch)
+    return found is not None and found.dataset == task.uuid and is_finished(found, last)
 
 
 def trained(recipe: TrainingRecipe, data: Path, run: RunFolder, *, section: str) -> Any:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.mesh.geometry import Mesh
 from training.avatar.maps import Views
-from training.networks.avatar import PointAvatar, Template
+from training.networks.avatar import CanonicalPoints, PointAvatar
 
 SIZES = {"map_size": 16, "unet_width": 2, "hidden_width": 16, "geometry": 8, "pose": 8}
 
@@ -24,11 +24,13 @@ def weights_of(mesh: Mesh) -> torch.Tensor:
     return torch.from_numpy(np.stack([1 - upper, upper], axis=1)).float()
 
 
-def template_of(mesh: Mesh, views: Views | None = None) -> Template:
+def template_of(mesh: Mesh, views: Views | None = None) -> CanonicalPoints:
     """A sphere's template."""
     places = (views or Views.of([mesh.vertices])).places(mesh.vertices)[..., :2]
     points = torch.from_numpy(mesh.vertices).float()
-    return Template(points, torch.nn.functional.normalize(points, dim=1), weights_of(mesh), torch.from_numpy(places))
+    return CanonicalPoints(
+        points, torch.nn.functional.normalize(points, dim=1), weights_of(mesh), torch.from_numpy(places)
+    )
 
 
 def bent(degrees: float, *, shift: float = 0.0) -> np.ndarray:

@@ -200,13 +200,13 @@ def test_a_step_that_is_not_finite_changes_nothing_nor_do_those_after_it(
     last: list[Learner] = []
     monkeypatch.setattr(Learner, "step", spoiled)
     recipe = tiny_training(steps=40, log_every=40, evaluate_every=40, checkpoint_every=40)
-    with pytest.raises(TrainingError, match=r"not finite at step 6 \(this rank's triples were \[\["):
+    with pytest.raises(TrainingError, match=r"not finite at step 6 \(this rank's examples were \[\["):
         train(recipe, data=dataset, run=tmp_path / "run")
     assert len(saved) == (6 if every == 1 else 8)
     before, after = saved[6], last[-1].network.state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
     kept = json.loads((tmp_path / "run" / "not-finite.json").read_text())
-    assert (kept["step"], kept["what"], len(kept["ranks"][0]["triples"])) == (6, "loss", 4)
+    assert (kept["step"], kept["what"], len(kept["ranks"][0]["examples"])) == (6, "loss", 4)
 
 
 def test_a_gradient_alone_that_is_not_finite_names_its_step(
@@ -222,7 +222,7 @@ def test_a_gradient_alone_that_is_not_finite_names_its_step(
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoiled)
     recipe = tiny_training(steps=40, log_every=40, evaluate_every=40, checkpoint_every=40)
     with pytest.raises(
-        TrainingError, match=r"step 5 \(in the gradient only; this rank's triples were \[\[.*not-finite"
+        TrainingError, match=r"step 5 \(in the gradient only; this rank's examples were \[\[.*not-finite"
     ):
         train(recipe, data=dataset, run=tmp_path / "run")
     kept = json.loads((tmp_path / "run" / "not-finite.json").read_text())

@@ -111,7 +111,7 @@ def test_nan_on_one_rank_stops_both_before_the_step(dataset: str, tmp_path: Path
     (first, said), (second, said_by_culprit) = finish(started)
     assert first and second
     assert "not finite at step 7 (on another rank)" in said
-    assert "not finite at step 7 (this rank's triples were [[" in said_by_culprit
+    assert "not finite at step 7 (this rank's examples were [[" in said_by_culprit
     assert require_checkpoint(tmp_path / "run").step == 4
     assert all(torch.isfinite(value).all() for value in weights(tmp_path / "run").values())
 

@@ -7,7 +7,7 @@ import torch
 from datagen.mesh.rig import skinned
 from tests.support.shapes.avatars import SIZES, avatar, bent, sphere, template_of
 from training.avatar.maps import PositionMaps, Views
-from training.networks.avatar import Avatar, PointAvatar, Template, read_maps
+from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar, read_maps
 from training.objectives.point_losses import Scan, avatar_loss
 from training.recipes.networks import AvatarRecipe
 
@@ -58,7 +58,7 @@ def test_corrections_are_skinned_and_displacements_are_in_the_pose() -> None:
 def test_points_in_another_order_come_out_in_that_order() -> None:
     network, order = avatar(BALL), torch.randperm(162, generator=torch.Generator().manual_seed(1))
     points, normals, weights, places = template_of(BALL)
-    again = PointAvatar([Template(points[order], normals[order], weights[order], places[:, order])], **SIZES)
+    again = PointAvatar([CanonicalPoints(points[order], normals[order], weights[order], places[:, order])], **SIZES)
     own = {"points", "normals", "weights", "places", "features"}
     again.load_state_dict({k: v for k, v in network.state_dict().items() if k not in own}, strict=False)
     again.features.data = network.features.data[order]

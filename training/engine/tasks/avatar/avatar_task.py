@@ -83,7 +83,7 @@ class AvatarTask:
 
     def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
         """See :class:`AvatarObjective`."""
-        steps = self._recipe.steps or self._recipe.epochs * self.order.steps_per_epoch
+        steps = self._recipe.last_step(self.order.steps_per_epoch)
         edges = [its.to(device) for its in self._wardrobe.edges()]
         return AvatarObjective(network, self._network.normals_from * steps, edges, self._network.roughness)
 
