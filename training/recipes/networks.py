@@ -155,6 +155,9 @@ class AvatarRecipe(NetworkSection):
     normalisation: Literal["group", "batch"] = Field(
         "group", description="group: nothing depends on batch or ranks; batch: as released"
     )
+    features_rate: float = Field(
+        1.0, gt=0, description="learning rate of the points' own features, in those of all else (released: 5/3)"
+    )
     scan_points: int = Field(20_000, ge=8, description="points of each scan that a step takes, others each time")
     normals_from: float = Field(
         0.625, ge=0, le=1, description="share of the training after which normals count (released: 250 of 401 epochs)"
@@ -167,7 +170,7 @@ class AvatarRecipe(NetworkSection):
 
     def sizes(self) -> dict[str, Any]:
         """Those of the network; the rest says how it is trained."""
-        return self.model_dump(exclude={"name", "scan_points", "normals_from", "roughness"})
+        return self.model_dump(exclude={"name", "features_rate", "scan_points", "normals_from", "roughness"})
 
     @property
     def title(self) -> str:

@@ -288,6 +288,8 @@ class TrainingRecipe(Frozen):
         for field, is_set in unknown.items():
             if is_set:
                 raise ValueError(f"network {self.network.name!r} knows no {field}: take it away")
+        if isinstance(self.network, AvatarRecipe) and self.network.features_rate != 1 and self.optimiser == "muon":
+            raise ValueError("optimiser 'muon' knows no network.features_rate: take it away, or use adam")
         if isinstance(self.network, AvatarRecipe) and self.network.normalisation == "batch" and self.ranks > 1:
             raise ValueError(
                 f"network.normalisation 'batch' would be each rank's own, but ranks is {self.ranks}: use 'group'"

@@ -75,7 +75,7 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
         return
     total, vertices, grid = 0.0, round(recipe.body.expected_vertices), recipe.identities.training * recipe.poses.seen
     for name, training in trainings.items():
-        steps = training.steps or training.epochs * (grid // training.batch)
+        steps = training.last_step(grid // training.batch)
         if steps * training.batch * (training.augmentation.subset or vertices) < _SOON or _on_gpu(training):
             continue
         say(f"{name}: trying a few steps, to tell how long {steps:,} will take here")

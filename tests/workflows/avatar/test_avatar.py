@@ -107,11 +107,15 @@ def test_another_recipe_in_its_folder_is_refused_before_anything_is_touched(
         ("avatar.compile=true", r"network 'avatar' knows no compile: take it away"),
         ("template.augmentation.turn=5", r"network 'template' knows no augmentation: take it away"),
         ("avatar.precision=bfloat16", r"knows no precision"),
+        (
+            "avatar.network.features_rate=2 avatar.optimiser=muon",
+            r"'muon' knows no network.features_rate: take it away",
+        ),
     ],
 )
 def test_keys_without_effect_are_refused(change: str, said: str, recipe: Path) -> None:
     with pytest.raises(RecipeError, match=said):
-        load_avatar(str(recipe), [change])
+        load_avatar(str(recipe), change.split())
 
 
 def test_batch_norm_is_of_one_rank(recipe: Path) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from training.engine.optimization.muon import Muon
+from training.recipes.networks import AvatarRecipe
 from training.recipes.training import ScheduleRecipe, TrainingRecipe
 
 ONE_CYCLE_FIRST = 1 / 25
@@ -25,7 +26,8 @@ ONE_CYCLE_FIRST = 1 / 25
 def build_optimiser(
     network: nn.Module, recipe: TrainingRecipe, *, rank: int = 0, ranks: int = 1
 ) -> torch.optim.Optimizer:
-    """Return the recipe's optimiser of all parameters, on one of so many ranks.
+    """Return the recipe's optimiser of all parameters, on one of so many ranks; those of an avatar's points may have
+    their own learning rate.
 
     In Adam weight decay is part of the gradient, in AdamW it is not (Loshchilov and Hutter, ICLR 2019). The fused
     form updates all parameters in one pass: on one core, 9.4 million in 5.5 ms instead of 24. Its bits depend neither
@@ -36,7 +38,16 @@ def build_optimiser(
     if recipe.optimiser == "muon":
         return Muon(network.parameters(), **rates, rank=rank, ranks=ranks)
     kind = {"adamw": torch.optim.AdamW, "adam": torch.optim.Adam}[recipe.optimiser]
-    return kind(network.parameters(), **rates, fused=True)
+    return kind(_groups(network, recipe), **rates, fused=True)
+
+
+def _groups(network: nn.Module, recipe: TrainingRecipe) -> list[dict[str, Any]]:
+    """Parameters by the ``factor`` of their learning rate."""
+    factor = recipe.network.features_rate if isinstance(recipe.network, AvatarRecipe) else 1.0
+    if factor == 1:
+        return [{"params": list(network.parameters())}]
+    shared = [parameter for name, parameter in network.named_parameters() if name != "features"]
+    return [{"params": shared}, {"params": [network.features], "factor": factor}]
 
 
 def load_optimiser(optimiser: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
@@ -125,7 +136,8 @@ class Schedule:
     Parameters
     ----------
     optimiser
-        Whose learning rates to set; that of the first step at once.
+        Whose learning rates to set; that of the first step at once. A group of parameters with a ``factor`` has so many
+        times the rate.
     rate
         Learning rate by the number of steps done before.
     """
@@ -165,7 +177,7 @@ class Schedule:
 
     def _set(self) -> None:
         for group in self._optimiser.param_groups:
-            group["lr"] = self._rate(self._done)
+            group["lr"] = self._rate(self._done) * group.get("factor", 1.0)
 
 
 class WeightAverage:

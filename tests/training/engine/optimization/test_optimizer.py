@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.support.recipes import tiny_training
+from tests.support.shapes.avatars import avatar, sphere
 from training.engine.optimization.optimizer import (
     Schedule,
     WeightAverage,
@@ -133,6 +134,26 @@ def test_stop_and_resume_is_the_same_bits_and_warns_of_nothing(schedule: dict[st
     assert first_rates + rest_rates == rates
     expected, found = whole[0].state_dict(), resumed[0].state_dict()
     assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+def test_points_of_an_avatar_have_a_learning_rate_of_their_own() -> None:
+    network = avatar(sphere())
+    recipe = TrainingRecipe.model_validate(
+        {"network": {"name": "avatar", "features_rate": 3.0}, "optimiser": "adam", "weight_decay": 0, "epsilon": 1e-30}
+    )
+    before = copy.deepcopy(network)
+    optimiser = build_optimiser(network, recipe)
+    schedule = build_schedule(optimiser, recipe, steps_per_epoch=1, steps=10)
+    assert schedule.get_last_lr() == [recipe.learning_rate, 3 * recipe.learning_rate]
+    for parameter in network.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimiser.step()
+    moved = {
+        name: (was - now).mean().item()
+        for (name, now), was in zip(network.named_parameters(), before.parameters(), strict=True)
+    }
+    assert moved.pop("features") == pytest.approx(3 * recipe.learning_rate, rel=1e-3)
+    assert all(way == pytest.approx(recipe.learning_rate, rel=1e-3) for way in moved.values())
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from workflows.pipeline.run_folder import RunFolder
 
 TEMPLATE = {"name": "template", "width": 32, "points": 300}
 AVATAR = {"name": "avatar", "map_size": 16, "unet_width": 2, "hidden_width": 16, "geometry": 8, "pose": 8,
-          "scan_points": 300, "normals_from": 0.5}  # fmt: skip
+          "features_rate": 2.0, "scan_points": 300, "normals_from": 0.5}  # fmt: skip
 
 
 def recipe_of(network: dict[str, Any], **changes: Any) -> TrainingRecipe:
