@@ -22,7 +22,16 @@ from datagen.grid import PoseType
 from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.folder import AVERAGE, WEIGHTS, manifest_of
-from training.evaluation.measure import NO_OPS, POSE_TYPES, Contender, Method, evaluation_list, measure_chunk
+from training.evaluation.measure import (
+    CONTROLS,
+    NO_OPS,
+    POSE_TYPES,
+    SKINNED,
+    Contender,
+    Method,
+    evaluation_list,
+    measure_chunk,
+)
 from training.evaluation.results import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows
 from training.recipes.training import EvaluationRecipe, NetworkRecipe
 
@@ -171,13 +180,13 @@ class _Piece:
 
 
 def _contenders(methods: Sequence[Method], dataset: Dataset, recipe: EvaluationRecipe) -> list[Contender]:
-    require_distinct([*(method.name for method in methods), *NO_OPS])
+    require_distinct([*(method.name for method in methods), *CONTROLS])
     if not any(len(evaluation_list(dataset, recipe, pose_type)) for pose_type in POSE_TYPES):
         raise EvaluationError(
             f"{dataset.url} lists no evaluation triples. Make a dataset that does: --set data.triples.count=400, with "
             "evaluation identities and at least two poses of a type"
         )
-    return [*(_resolved(method, dataset, recipe) for method in methods), *(Contender(name, "") for name in NO_OPS)]
+    return [*(_resolved(method, dataset, recipe) for method in methods), *(Contender(name, "") for name in CONTROLS)]
 
 
 def _resolved(method: Method, dataset: Dataset, recipe: EvaluationRecipe) -> Contender:
@@ -210,7 +219,8 @@ def _pieces(dataset: Dataset, contenders: Sequence[Contender], recipe: Evaluatio
     pieces = []
     for pose_type in POSE_TYPES:
         listed = evaluation_list(dataset, recipe, pose_type)
-        able = [its for its in contenders if its.name != NO_OPS[1] or _one_count(dataset, listed)]
+        unable = [name for name, is_able in _CAN_STAND.items() if not is_able(dataset, listed)]
+        able = [its for its in contenders if its.name not in unable]
         for start in range(0, len(listed), recipe.chunk):
             triples = listed[start : start + recipe.chunk]
             pieces += [_piece(dataset, its, recipe, pose_type, start, triples) for its in able]
@@ -249,3 +259,13 @@ def _one_count(dataset: Dataset, triples: NDArray[np.integer]) -> bool:
     """Whether all sources and targets of a list have as many vertices, so that a source can stand for an output."""
     identities = np.unique(triples[:, [0, 2]]).tolist()
     return len({dataset.vertex_count(identity) for identity in identities}) == 1
+
+
+def _are_dressed(dataset: Dataset, triples: NDArray[np.integer]) -> bool:
+    """Whether a target of a list has garments, and all have rigs, so that skinning alone can stand for an output."""
+    targets = np.unique(triples[:, 2]).tolist()
+    return any(dataset.part(its) is not None for its in targets) and all(dataset.rig(its) for its in targets)
+
+
+_CAN_STAND = {NO_OPS[1]: _one_count, SKINNED: _are_dressed}
+"""Controls that not every list has."""

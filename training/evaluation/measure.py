@@ -1,7 +1,8 @@
 """Every metric of outputs, and measuring some methods on one chunk of triples: the work of one task of an evaluation.
 
 The no-op baselines say what a method that does nothing would score: ``target unchanged`` returns the target as it is
-(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity).
+(right identity, wrong pose), ``source unchanged`` returns the source (right pose, wrong identity). Of dressed targets
+``target skinned`` says what a method that is perfect but knows no cloth would score: the target moved by its own rig.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,15 +20,19 @@ from torch import Tensor, nn
 from datagen.common.resources import memory_errors
 from datagen.grid import PoseType
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
+from datagen.mesh.rig import rest_vertices, skinned, world_rotations
 from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
-from training.evaluation.results import Row, Score
+from training.evaluation.results import Dressed, Row, Score
 from training.inference.predict import load_trained, predict, surfaces_of, takes_surfaces
 from training.inference.projection import OntoParts
 from training.objectives import metrics
 from training.recipes.training import EvaluationRecipe
 
 NO_OPS = ("target unchanged", "source unchanged")
+SKINNED = "target skinned"
+CONTROLS = (*NO_OPS, SKINNED)
+"""Methods without a network."""
 POSE_TYPES: tuple[PoseType, ...] = ("seen", "unseen")
 
 
@@ -70,21 +75,38 @@ def _measured(
     contenders: Sequence[Contender], dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType, start: int
 ) -> list[Row]:
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    told = any(takes_surfaces(_network_of(its)) for its in contenders if its.name not in NO_OPS)
+    told = any(takes_surfaces(_network_of(its)) for its in contenders if its.name not in CONTROLS)
     batch, groups = read_batch(dataset, triples, padded=True, surfaces=told), _groups(dataset, triples)
     return [
-        Row(contender.name, pose_type, start + place, *map(int, triple), *astuple(score))
+        Row(contender.name, pose_type, start + place, *map(int, triples[place]), *astuple(score), *astuple(dressed))
         for contender in contenders
-        for place, (triple, score) in enumerate(
-            zip(triples, _measure_each(groups, _output(contender, batch), batch.truth, recipe), strict=True)
+        for place, (score, dressed) in enumerate(
+            _measure_each(groups, _output(contender, batch, dataset, triples), batch.truth, recipe)
         )
     ]
 
 
-def _output(contender: Contender, batch: Batch) -> Tensor:
+def _output(contender: Contender, batch: Batch, dataset: Dataset, triples: NDArray[np.integer]) -> Tensor:
+    if contender.name == SKINNED:
+        return _skinned(dataset, triples, batch.truth)
     if contender.name in NO_OPS:
         return batch.target if contender.name == NO_OPS[0] else batch.source
     return predict(_network_of(contender), batch)
+
+
+def _skinned(dataset: Dataset, triples: NDArray[np.integer], like: Tensor) -> Tensor:
+    """Targets ``[b, v, 3]`` in the source's pose by their own rigs, in the truth's box; padded as ``like`` is."""
+    rotations, parents = dataset.rotations(), dataset.attributes["joint_parents"]
+    found = torch.zeros_like(like)
+    for place, (_, wanted, identity, pose) in enumerate(triples.tolist()):
+        rig, vertices = dataset.rig(identity), dataset.vertices(identity, pose).astype(np.float64)
+        assert rig is not None
+        here, there = rig.transforms(world_rotations(rotations[[pose, wanted]], parents))
+        unposed = rest_vertices(vertices[None], rig.weights, here[None])
+        box = bounding_box(dataset.vertices(identity, wanted).astype(np.float64))
+        moved = box.normalise(skinned(unposed, rig.weights, there[None])[0])
+        found[place, : len(moved)] = torch.from_numpy(moved)
+    return found
 
 
 def _network_of(contender: Contender) -> nn.Module:
@@ -100,13 +122,17 @@ def _network(weights: str, projected_by: str, sha256: str) -> nn.Module:
 
 @dataclass(frozen=True)
 class _Group:
-    """Triples of one target identity in a chunk: their places, vertices, edges, faces, and metres a box unit is."""
+    """Triples of one target identity in a chunk: places, vertices, edges, faces, metres a box unit is, and garments.
+
+    ``is_garment`` [vertex]: which vertices are; None of a bare identity.
+    """
 
     places: list[int]
     count: int
     edges: Tensor
     faces: Tensor
     metres: Tensor
+    is_garment: Tensor | None
 
 
 def _groups(dataset: Dataset, triples: NDArray[np.integer]) -> list[_Group]:
@@ -117,18 +143,30 @@ def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Gr
     places, faces = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.faces(identity)
     metres = [float(bounding_box(dataset.vertices(identity, int(triples[place, 1]))).half) for place in places]
     edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
-    return _Group(places, dataset.vertex_count(identity), edges, triangles, torch.tensor(metres, dtype=torch.float64))
+    lengths, part = torch.tensor(metres, dtype=torch.float64), dataset.part(identity)
+    is_garment = None if part is None else torch.from_numpy(part > 0)
+    return _Group(places, dataset.vertex_count(identity), edges, triangles, lengths, is_garment)
 
 
-def _measure_each(groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe) -> list[Score]:
+def _measure_each(
+    groups: Sequence[_Group], output: Tensor, truth: Tensor, recipe: EvaluationRecipe
+) -> list[tuple[Score, Dressed]]:
     """Metrics of each triple over its target's own vertices and faces; rows after its count are padding."""
-    found: dict[int, Score] = {}
+    found: dict[int, tuple[Score, Dressed]] = {}
     for its in groups:
         ours, right = output[its.places, : its.count], truth[its.places, : its.count]
         about: dict[str, Any] = {"emd_points": recipe.emd_points, "seed": recipe.seed}
         scores = measure(ours, right, edges=its.edges, faces=its.faces, metres=its.metres, **about)
-        found |= zip(its.places, scores, strict=True)
+        found |= zip(its.places, zip(scores, _by_part(its, ours, right), strict=True), strict=True)
     return [found[place] for place in range(len(found))]
+
+
+def _by_part(group: _Group, output: Tensor, truth: Tensor) -> list[Dressed]:
+    if group.is_garment is None:
+        return [Dressed()] * len(output)
+    parts = (~group.is_garment, group.is_garment)
+    errors = (metrics.mean_euclidean_error(output[:, its], truth[:, its]) * group.metres * 1000 for its in parts)
+    return [Dressed(*values) for values in zip(*(its.tolist() for its in errors), strict=True)]
 
 
 def measure(

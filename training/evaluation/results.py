@@ -4,7 +4,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,11 +59,12 @@ def read_csv(path: Path, kind: type[RowType]) -> list[RowType]:
         It is not there, or cannot be read.
     """
     types: dict[str, Any] = {field.name: field.type for field in fields(kind)}  # type: ignore[arg-type]
-    lines = io.StringIO(read_text_within(path.parent, path.name, limit=_LONGEST), newline="")
+    younger = {field.name for field in fields(kind) if field.default is not MISSING}
+    text = read_text_within(path.parent, path.name, limit=_LONGEST)
     try:
-        return [
-            kind(**{name: its(_as_given(line[name])) for name, its in types.items()}) for line in csv.DictReader(lines)
-        ]
+        lines = csv.DictReader(io.StringIO(text, newline=""))
+        named = types.keys() - (younger - set(lines.fieldnames or ()))
+        return [kind(**{name: types[name](_as_given(line[name])) for name in named}) for line in lines]
     except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
         raise DamagedFileError(f"{path} holds other than rows of measurements ({error}). Measure again") from error
 
@@ -102,6 +103,14 @@ class Score:
 
 
 @dataclass(frozen=True, order=True)
+class Dressed:
+    """Mean Euclidean error of the skin and of the garments of a dressed target, in millimetres; 0 of a bare one."""
+
+    skin_millimetres: float = 0.0
+    garment_millimetres: float = 0.0
+
+
+@dataclass(frozen=True, order=True)
 class Triple:
     """Number of an evaluation triple, and what it is of: source (identity, pose) and target (identity, pose)."""
 
@@ -121,7 +130,7 @@ class Listed:
 
 
 @dataclass(frozen=True, order=True)
-class Row(Score, Triple, Listed):
+class Row(Dressed, Score, Triple, Listed):
     """One method on one evaluation triple. Fields come in the order of a file's columns: the last base's first."""
 
 

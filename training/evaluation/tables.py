@@ -9,7 +9,7 @@ import numpy as np
 from datagen.store import Dataset
 from training.evaluation import paper_numbers as paper
 from training.evaluation.document import Line, Table, Text, cell_of, document_markdown, plain, with_best
-from training.evaluation.measure import NO_OPS, POSE_TYPES
+from training.evaluation.measure import CONTROLS, NO_OPS, POSE_TYPES, SKINNED
 from training.evaluation.results import Row
 from training.evaluation.statistics import BOOTSTRAP, differences, interval, spread_over, values_of
 from training.evaluation.timing import Inference
@@ -29,6 +29,10 @@ DEFINITIONS = """\
 - **edge** mean |output edge / true edge - 1|. **normal** mean angle between face normals, in degrees.
 - *target unchanged* and *source unchanged* are no-op baselines: what doing nothing would score. The second knows
   more than the network: that source and target list corresponding vertices in one order, as they do in this data."""
+
+DRESSED = f"""\
+- **skin mm**, **garment mm**: mm over the vertices of dressed targets that are skin, and those that are garments.
+  *{SKINNED}* is a control: the target moved to the source's pose by its own rig, exact but for what cloth does."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,19 @@ COLUMNS = (
     Column("normal", "normal_degrees", 1.0, 1),
 )
 
+DRESSED_COLUMNS = (Column("skin mm", "skin_millimetres", 1.0, 1), Column("garment mm", "garment_millimetres", 1.0, 1))
+
+
+def is_dressed(row: Row) -> bool:
+    """Whether the target has garments."""
+    return row.skin_millimetres + row.garment_millimetres > 0
+
 
 def methods_of(rows: Iterable[Row]) -> list[str]:
     """Methods in the rows: trained ones first, then the no-op baselines."""
     names = dict.fromkeys(row.method for row in rows)
-    return sorted(names, key=lambda name: (name.endswith("unchanged"), name == "source unchanged", name))
+    place = {name: number for number, name in enumerate(CONTROLS, 1)}
+    return sorted(names, key=lambda name: (place.get(name, 0), name))
 
 
 def mean_of(rows: Iterable[Row], *, method: str, pose_type: str, field: str) -> float:
@@ -67,11 +79,15 @@ def mean_of(rows: Iterable[Row], *, method: str, pose_type: str, field: str) -> 
 
 def summary(rows: Sequence[Row]) -> Table:
     """One line for each method and pose type, as text."""
-    lines = [["poses", "method", *(column.heading for column in COLUMNS)]]
+    dressed = [row for row in rows if is_dressed(row)]
+    by_part = DRESSED_COLUMNS if dressed else ()
+    lines = [["poses", "method", *(column.heading for column in (*COLUMNS, *by_part))]]
     for pose_type in POSE_TYPES:
         for method in methods_of(rows):
             if any((row.method, row.pose_type) == (method, pose_type) for row in rows):
-                lines.append([pose_type, method, *(_mean(rows, method, pose_type, column) for column in COLUMNS)])
+                means = [_mean(rows, method, pose_type, column) for column in COLUMNS]
+                means += [_mean(dressed, method, pose_type, column) for column in by_part]
+                lines.append([pose_type, method, *means])
     return Table(lines)
 
 
@@ -87,7 +103,7 @@ def emphasised(table: Table) -> Table:
 def _contest(table: Table, line: Line) -> tuple[bool, str] | None:
     cells = [cell_of(cell).text for cell in line]
     poses = cells[0] if cell_of(table.lines[0][0]).text == "poses" else ""
-    return None if set(NO_OPS) & set(cells) else (_is_theirs(line), poses)
+    return None if set(CONTROLS) & set(cells) else (_is_theirs(line), poses)
 
 
 def _is_theirs(line: Line) -> bool:
@@ -108,7 +124,7 @@ def results(rows: Sequence[Row], *, about: str, emd_points: int) -> tuple[Text |
         Text(f"{about} New identities; fixed triples: {triples}. Lower is better in every column."),
         summary(rows),
         Text(spread(rows)),
-        Text(DEFINITIONS.format(points=emd_points)),
+        Text(DEFINITIONS.format(points=emd_points) + (f"\n{DRESSED}" if any(map(is_dressed, rows)) else "")),
     )
 
 
@@ -189,7 +205,7 @@ def table_3(rows: Sequence[Row], *, here: str, emd_points: int) -> Table:
 
     One column is added, the edge-length error on unseen poses, which is what the edge loss is for.
     """
-    methods = [method for method in methods_of(rows) if method not in NO_OPS]
+    methods = [method for method in methods_of(rows) if method not in CONTROLS]
     lines = _comparison(rows, methods, paper.TABLE_3, label=f"{THEIRS}, SMPL", more=("edge_ratio",))
     return Table(lines, "Table 3: what its parts are worth", _note("SMPL", here, emd_points))
 
@@ -220,10 +236,14 @@ def _comparison(
     for method in _in_papers_order(methods):
         cells = [_mean(rows, method, its, column) for its, column in columns]
         cells += [_interval(_pmd(rows, method, pose_type)), _difference(rows, method, reference, pose_type)]
-        lines.append([method, "no-op" if method in NO_OPS else "ours", *cells])
+        lines.append([method, _kind(method), *cells])
         if _short(method) in theirs:
             lines.append([method, label, *_cells(theirs[_short(method)]), *[""] * (len(more) + 2)])
     return lines
+
+
+def _kind(method: str) -> str:
+    return "no-op" if method in NO_OPS else "control" if method == SKINNED else "ours"
 
 
 def _cells(scores: paper.SeenUnseen) -> list[str]:
@@ -238,7 +258,7 @@ def _short(method: str) -> str:
 def _in_papers_order(methods: Iterable[str]) -> list[str]:
     known = [*paper.TABLE_2, *paper.TABLE_3]
     place = {name: known.index(_short(name)) if _short(name) in known else len(known) for name in methods}
-    return sorted(place, key=lambda name: (name in NO_OPS, place[name]))
+    return sorted(place, key=lambda name: (name in CONTROLS, place[name]))
 
 
 def _reference(methods: Sequence[str]) -> str:

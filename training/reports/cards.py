@@ -15,6 +15,7 @@ from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_check
 from training.checkpoints.folder import AVERAGE, WEIGHTS
 from training.evaluation.document import Table, Text, plain
 from training.evaluation.evaluate import NO_OPS, POSE_TYPES, Row
+from training.evaluation.measure import CONTROLS
 from training.evaluation.run_curves import run_curve
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
 from training.networks import network_from
@@ -122,7 +123,7 @@ def _changed(recipe: TrainingRecipe) -> Table:
 def _results(rows: list[Row]) -> list[Block]:
     if not rows:
         return [Text("### Results\n\nNot evaluated yet: `dsffnet evaluate RUN --data X.zarr`.")]
-    lines = [line for line in summary(rows).lines if line[1] not in NO_OPS]
+    lines = [line for line in summary(rows).lines if line[1] not in CONTROLS]
     return [Table(lines, "Results on new identities", "Lower is better; definitions stand by the main table.")]
 
 

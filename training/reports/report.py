@@ -14,7 +14,8 @@ from datagen.common.printable import printable_lines
 from datagen.store import Dataset, open_dataset
 from training.checkpoints.checkpoint import recipe_of, require_checkpoint
 from training.evaluation.document import Cell, Table, Text, plain, with_best
-from training.evaluation.evaluate import NO_OPS, Row, read_rows
+from training.evaluation.evaluate import Row, read_rows
+from training.evaluation.measure import CONTROLS
 from training.evaluation.tables import about_weights, mean_of, methods_of, results
 from training.inference.projection import PROJECTED
 from training.recipes.training import EvaluationRecipe
@@ -143,7 +144,7 @@ def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]
 
 def _runs(out: Path, rows: Sequence[Row]) -> dict[str, Path]:
     """The trainings by the names that the rows give them: what a workflow trains, and what it trains beside it."""
-    names = [name for name in methods_of(rows) if name not in NO_OPS and not name.endswith(PROJECTED)]
+    names = [name for name in methods_of(rows) if name not in CONTROLS and not name.endswith(PROJECTED)]
     main = _name_of(out / "run")
     if len(names) != 2 or main not in names:
         return {methods_of(rows)[0]: out / "run"}
