@@ -58,8 +58,9 @@ def read_csv(path: Path, kind: type[RowType]) -> list[RowType]:
     FileNotFoundError, OSError
         It is not there, or cannot be read.
     """
-    types: dict[str, Any] = {field.name: field.type for field in fields(kind)}  # type: ignore[arg-type]
-    younger = {field.name for field in fields(kind) if field.default is not MISSING}
+    columns = fields(kind)  # type: ignore[arg-type]
+    types: dict[str, Any] = {field.name: field.type for field in columns}
+    younger = {field.name for field in columns if field.default is not MISSING}
     text = read_text_within(path.parent, path.name, limit=_LONGEST)
     try:
         lines = csv.DictReader(io.StringIO(text, newline=""))
