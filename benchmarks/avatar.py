@@ -198,6 +198,7 @@ class Run:
         centre, radius = (body.min(axis=0) + body.max(axis=0)) / 2, float(np.ptp(body, axis=0).max() / 2)
         network = OccupancyTemplate(centre=centre.tolist(), radius=radius, width=self.width)
         adam = torch.optim.Adam(network.parameters(), 1e-3)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps)
         for step in range(self.steps):
             if step % _EVERY == 0:
                 self.measure(step, network, samples, conditions)
@@ -209,6 +210,7 @@ class Run:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 0.1)
             adam.step()
+            falling.step()
         self.measure(self.steps, network, samples, conditions)
         return network
 
@@ -223,7 +225,7 @@ def template(run: Run, subject: Subject, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     poses = draw_poses(PoseRecipe(), range(run.seen + run.unseen))
     with timed("field"):
-        weights = diffused_skinning(subject.body, margin=0.2)
+        weights = diffused_skinning(subject.body, margin=0.25)
     samples, conditions = _samples(subject, poses, weights), pose_condition(poses.rotations)
     with timed(f"{run.steps} steps"):
         network = run.train(subject, samples, conditions)

@@ -28,7 +28,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, ClothedBody, PoseRecipe
 from training.avatar.maps import PositionMaps, Views
-from training.avatar.metrics import Surface, footprint_drift, score
+from training.avatar.metrics import Footprints, Surface, score
 from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges, Scan, avatar_loss
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
@@ -160,7 +160,7 @@ def _some(surface: Surface, random: np.random.Generator) -> Scan:
 def report(subject: Subject) -> None:
     """The table: template and skinning, with correction, with displacement; seen and unseen poses."""
     subject.network.eval()
-    print("poses | stage | to model | to scan | plane | normal | Hausdorff | Chamfer 1e-5 | cosine | drift")
+    print("poses | stage | to model | to scan | plane | normal | Hausdorff | Chamfer 1e-5 | cosine | corresponding")
     for kind, poses in (("seen", range(_UNSEEN)), ("unseen", range(_SEEN, _SEEN + _UNSEEN))):
         avatars = [subject.posed([pose]) for pose in poses]
         for stage in ("template + skinning", "+ correction", "+ displacement"):
@@ -178,9 +178,10 @@ def _told(data: Data, kind: str, stage: str, poses: range, avatars: list[Avatar]
         )
         for mesh, avatar, pose in zip(meshes, avatars, poses, strict=True)
     ]
-    drift = footprint_drift([its.vertices for its in meshes], [data.scan(pose) for pose in poses], data.canonical)
+    footprints = Footprints.of(meshes[0].vertices, data.scan(poses[0]))
+    away = [footprints.distances(its.vertices, data.scans[pose]) for its, pose in zip(meshes, poses, strict=True)]
     means = np.mean([astuple(its)[:7] for its in scores], axis=0) * [1, 1, 1, 1, 1, 1e5, 1]
-    print(kind, "|", stage, "|", " | ".join(f"{its:.3g}" for its in [*means, 1000 * np.median(drift)]), flush=True)
+    print(kind, "|", stage, "|", " | ".join(f"{its:.3g}" for its in [*means, 1000 * np.mean(away[1:])]), flush=True)
     for part in range(int(data.parts.max()) + 1):
         own = np.nanmean([its.parts[part] for its in scores if part in its.parts], axis=0)
         print("   part", part, "|", " | ".join(f"{its:.3g}" for its in own), flush=True)

@@ -20,7 +20,7 @@ The last two are those of the released code. Figures depend on the number of sam
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -151,30 +151,35 @@ def score(
     )
 
 
-def footprint_drift(points: Sequence[Floats], scans: Sequence[Mesh], rest: Floats) -> NDArray[np.float64]:
-    """How far each point [n] slides over the surface between poses, in metres: the corresponding error.
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Places on a scan's surface that move with it: simulated scans share their vertices, so each is one bit of cloth.
 
-    A point's footprint in a pose is the nearest place of the scan's surface, carried to ``rest``. Simulated scans share
-    their vertices, so that footprints of one point in all poses can be compared; those of a point that stays where it
-    is on the cloth are one. The mean over poses of the distance from their mean.
-
-    Parameters
+    Attributes
     ----------
-    points
-        Of the model in each pose ``[n, 3]``.
-    scans
-        In the same poses, with the same faces.
-    rest
-        The scans' vertices ``[vertex, 3]`` in one pose, in which footprints are compared.
+    corners
+        Numbers of the scan's vertices ``[n, 3]``, of the triangle that a place lies on.
+    shares
+        Of these in the place, ``[n, 3]``.
     """
-    prints = np.stack([_footprints(its, scan, rest) for its, scan in zip(points, scans, strict=True)])
-    drift: NDArray[np.float64] = np.linalg.norm(prints - prints.mean(axis=0), axis=2).mean(axis=0)
-    return drift
 
+    corners: NDArray[np.int64]
+    shares: NDArray[np.float64]
 
-def _footprints(points: Floats, scan: Mesh, rest: Floats) -> NDArray[np.float64]:
-    face, shares = Surface.sampled(scan, 4 * len(scan.faces)).closest(points)
-    return (shares[..., None] * np.asarray(rest, np.float64)[scan.faces[face]]).sum(axis=1)
+    @classmethod
+    def of(cls, points: Floats, scan: Mesh) -> Footprints:
+        """Those nearest to points ``[n, 3]``."""
+        face, shares = Surface.sampled(scan, 4 * len(scan.faces)).closest(points)
+        return cls(np.asarray(scan.faces, np.int64)[face], shares)
+
+    def distances(self, points: Floats, vertices: Floats) -> NDArray[np.float64]:
+        """Distances ``[n]`` of points ``[n, 3]`` from their places on the scan of another pose, in metres.
+
+        The corresponding error: a point that slides over the cloth has one, however near to the surface it stays.
+        """
+        places = (self.shares[..., None] * np.asarray(vertices, np.float64)[self.corners]).sum(axis=1)
+        away: NDArray[np.float64] = np.linalg.norm(np.asarray(points, np.float64) - places, axis=1)
+        return away
 
 
 def _mean_cosine(one: Surface, other: Surface) -> float:

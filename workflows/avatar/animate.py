@@ -10,18 +10,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datagen.common.errors import MeshError, RecipeError
+from datagen.mesh.files import read_mesh_file
 from datagen.mesh.formats.glb_export import built_draft
 from datagen.mesh.formats.surface import Material, Surface
 from datagen.mesh.limits import FRAME_LIMIT
+from datagen.mesh.sequences import frames_of
 from datagen.poses import Poses, draw_poses
 from datagen.poses.pose_files import read_pose_file
 from datagen.recipe import PoseRecipe
 from training.avatar.subject import posed_by
+from training.inference.pose_reading import read_poses
 from training.viz.mesh_grid import contact_sheet
 from workflows.avatar.evaluate import learned_avatar, require_avatar
 from workflows.avatar.recipe import load_avatar
 from workflows.pipeline.progress import bar
 from workflows.pipeline.run_folder import AvatarFolder
+from workflows.pretrained import own_weights
 
 _ON_THE_WAY = 12  # frames from one pose to the next
 _COLOR = "#C9B458"
@@ -79,17 +83,27 @@ def animate(
         contact_sheet(rows, [faces] * 2, ["", ""], [""] * half, picture, colors_per_row=[to_rgb(_COLOR)] * 2)
 
 
-def poses_of(folder: AvatarFolder, file: Path | None, *, count: int, seed: int) -> Poses:
-    """The poses of a file, or a walk through some random ones of the distribution that the avatar learned from.
+def poses_of(folder: AvatarFolder, file: Path | None, source: Path | None = None, *, count: int, seed: int) -> Poses:
+    """The poses of a file, or those that people are in, or a walk through random ones that the avatar learned from.
+
+    ``source``: a mesh, a folder or a pattern of frames; poses are read off them by the weights ``human``.
 
     Raises
     ------
     RecipeError
-        The file holds no poses; the folder holds no recipe.
+        The file holds no poses; the folder holds no recipe; both are named.
+    MeshError
+        A mesh cannot be read, or is no person.
     """
     require_avatar(folder)
+    if file and source:
+        raise RecipeError("--poses and --source both say what to play: name one")
     if file:
         return read_pose_file(file)
+    if source:
+        files = [source] if source.is_file() else frames_of(source)
+        meshes = (read_mesh_file(each).mesh for each in bar(files, total=len(files), what="read poses", unit="mesh"))
+        return Poses(*read_poses(own_weights("human"), meshes))
     recipe = load_avatar(str(folder.recipe)).data.poses
     drawn = draw_poses(PoseRecipe(distribution=recipe.distribution, seed=recipe.seed + 1 + seed), range(count))
     return Poses(drawn.joints, drawn.parents, _walk(drawn.rotations))

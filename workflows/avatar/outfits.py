@@ -1,6 +1,6 @@
 """From a dataset of dressed people to the folders of outfits: body, scans, field, points around and on the scans."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from datagen.common.errors import CheckpointError, UnsafeFileError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.rig import skinned
+from datagen.poses import Poses
 from datagen.recipe import ClothedBody
 from datagen.store import Dataset
 from training.avatar.body import canonical_body
@@ -57,23 +58,18 @@ def is_of(outfit: Outfit, source: str) -> bool:
 
 
 def subjects_of(dataset: Dataset) -> Iterator[Subject]:
-    """The people of a dataset's evaluation split, each by the name of the outfit; a second one in it gets a number."""
-    body, recipe = load_body(dataset.recipe.body), dataset.recipe.body
-    assert isinstance(body, ClothedModel) and isinstance(recipe, ClothedBody)
+    """The people of a dataset's evaluation split, by the names of :func:`wearers`."""
+    body = load_body(dataset.recipe.body)
+    assert isinstance(body, ClothedModel)
     joints, parents = tuple(dataset.attributes["joints"]), tuple(dataset.attributes["joint_parents"])
-    names = list[str]()
-    for identity in dataset.identities("evaluation"):
-        parameters = dataset.parameters(identity)
-        outfit = recipe.outfits[int(parameters[-2])]
-        numbered = (f"{outfit}-{number}" for number in count(2))
-        names.append(next(name for name in chain([outfit], numbered) if name not in names))
-        rig, vertices, faces = body.undressed(parameters, joints)
+    for name, identity in wearers(dataset).items():
+        rig, vertices, faces = body.undressed(dataset.parameters(identity), joints)
         canonical = canonical_body(rig, vertices, faces, joints, parents)
         poses = dataset.grid.poses_of(identity)
         rotations, labels = dataset.rotations()[poses], dataset.part(identity)
         assert labels is not None
         yield Subject(
-            name=names[-1],
+            name=name,
             source=dataset.uuid,
             body=canonical,
             scans=np.asarray(dataset.vertices(identity, poses), np.float32),
@@ -83,6 +79,36 @@ def subjects_of(dataset: Dataset) -> Iterator[Subject]:
             rotations=rotations.astype(np.float32),
             is_seen=np.isin(poses, dataset.grid.poses("seen")),
         )
+
+
+def wearers(dataset: Dataset) -> dict[str, int]:
+    """The identities of the evaluation split, each by the name of the outfit; a second one in it gets a number."""
+    recipe, found = dataset.recipe.body, dict[str, int]()
+    assert isinstance(recipe, ClothedBody)
+    for identity in dataset.identities("evaluation"):
+        outfit = recipe.outfits[int(dataset.parameters(identity)[-2])]
+        numbered = (f"{outfit}-{number}" for number in count(2))
+        found[next(name for name in chain([outfit], numbered) if name not in found)] = identity
+    return found
+
+
+def is_draped(dataset: Dataset) -> bool:
+    """Whether the clothes of a dataset's people are simulated."""
+    return isinstance(dataset.recipe.body, ClothedBody) and dataset.recipe.body.method == "draped"
+
+
+def draped_finer(dataset: Dataset, identity: int, frames: Sequence[int]) -> NDArray[np.float32]:
+    """Scans [frame, vertex, 3] of an identity by twice as many stations, steps at each, and steps to settle.
+
+    How far these are from the dataset's is the simulation's own error, which no avatar can be judged below.
+    """
+    recipe = dataset.recipe.body
+    assert isinstance(recipe, ClothedBody)
+    steps = {name: 2 * getattr(recipe.solver, name) for name in ("frames", "substeps", "settle")}
+    finer = load_body(recipe.model_copy(update={"solver": recipe.solver.model_copy(update=steps)}))
+    rotations = dataset.rotations()[dataset.grid.poses_of(identity)[list(frames)]]
+    joints, parents = tuple(dataset.attributes["joints"]), tuple(dataset.attributes["joint_parents"])
+    return finer.vertices(dataset.parameters(identity), Poses(joints, parents, rotations))
 
 
 def _field(recipe: FieldRecipe, subject: Subject) -> SkinningField:

@@ -19,7 +19,9 @@ class FieldRecipe(Frozen):
 
     centres: int = Field(1500, ge=16, le=5000, description="points of the skin that the spline goes through")
     spacing: float = Field(0.03, ge=0.004, le=0.2, description="metres between the grid's cells")
-    margin: float = Field(0.15, ge=0.01, le=1, description="metres around the body that the grid covers")
+    margin: float = Field(
+        0.25, ge=0.01, le=1, description="metres around the body that the grid covers; skirts stand out by 0.2"
+    )
 
 
 class ScanRecipe(Frozen):

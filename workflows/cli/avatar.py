@@ -61,6 +61,7 @@ def _animate_options(made: Parser) -> None:
     add = made.add_argument
     add("--outfit", metavar="NAME", help="which one, where there are several")
     add("--poses", type=Path, metavar="FILE.npz", help="poses, joints, parents (docs/importing.md); default: a walk")
+    add("--source", type=Path, metavar="MESH", help="a person to move like: a mesh, a folder or a pattern of frames")
     add("--stations", type=int, default=5, metavar="N", help="random poses that a walk goes through (default 5)")
     add("--seed", type=int, default=0, help="of these poses")
     add("--fps", type=rate, default=24.0, help="frames a second (default 24)")
@@ -79,6 +80,7 @@ def avatar_command(options: argparse.Namespace) -> None:
     examples:
       dsffnet avatar train --recipe avatar-small --out runs/avatar
       dsffnet avatar animate runs/avatar --outfit skirt -o walk.glb --picture walk.png
+      dsffnet avatar animate runs/avatar --outfit skirt -o like.glb --source person.obj
       dsffnet avatar evaluate runs/avatar --frames 16
     """
     options.work(options)
@@ -138,7 +140,7 @@ def _animate(options: argparse.Namespace) -> None:
     if options.stations < 2:
         raise RecipeError(f"--stations {options.stations}: a walk needs two poses or more")
     folder = AvatarFolder(options.folder)
-    poses = poses_of(folder, options.poses, count=options.stations, seed=options.seed)
+    poses = poses_of(folder, options.poses, options.source, count=options.stations, seed=options.seed)
     animate(folder, options.outfit, poses, options.out, frames_per_second=options.fps, picture=options.picture)
 
 

@@ -6,7 +6,7 @@ import trimesh
 
 from datagen.mesh.geometry import Mesh
 from tests.support.shapes.avatars import sphere
-from training.avatar.metrics import Surface, footprint_drift, score
+from training.avatar.metrics import Footprints, Surface, score
 from training.viz.render.lighting import vertex_normals
 
 
@@ -97,10 +97,11 @@ def test_samples_are_spread_by_area() -> None:
     assert np.abs(found.points[found.points[:, 1] > 0.5].mean(axis=0) - [0.5, 1, 0.5]).max() < 0.01
 
 
-def test_a_point_that_keeps_its_place_on_the_cloth_does_not_drift_and_one_that_slides_does() -> None:
-    rest = sheet(0.0)
-    scans = [sheet(0.0, shift=5.0), sheet(2.0, shift=-1.0)]
-    still = np.array([[0.3, 0.01, 0.4], [0.7, 0.0, 0.7]])
-    shifts = np.array([[[5, 0, 0], [5, 0, 0]], [[-1, 2, 0], [-1, 2, 0.02]]])
-    drift = footprint_drift(still + shifts, scans, rest.vertices)
-    assert drift == pytest.approx([0, 0.01], abs=1e-9)
+def test_a_point_that_keeps_its_place_on_the_cloth_has_its_distance_as_error_and_one_that_slides_more() -> None:
+    points = np.array([[0.3, 0.01, 0.4], [0.7, 0.0, 0.7]])
+    footprints = Footprints.of(points, sheet(0.0))
+    assert footprints.distances(points, sheet(0.0).vertices) == pytest.approx([0.01, 0], abs=1e-9)
+    moved, slid = sheet(2.0, shift=-1.0), points + np.array([[-1, 2, 0], [-1, 2, 0.02]])
+    found = footprints.distances(slid, moved.vertices)
+    assert found == pytest.approx([0.01, 0.02], abs=1e-9)
+    assert Surface.sampled(moved, 1000).distances(slid[1:]) == pytest.approx(0, abs=1e-9)

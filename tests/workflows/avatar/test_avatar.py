@@ -10,9 +10,12 @@ import pytest
 import trimesh
 import yaml
 
+from datagen.bodies import load_body
 from datagen.common.errors import MeshError, RecipeError
-from datagen.poses import JOINTS, PARENTS, Poses
+from datagen.common.seeding import Stream, generator
+from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.poses.pose_files import write_pose_file
+from datagen.recipe import AnnyBody, PoseRecipe
 from tests.support.commands import command
 from tests.support.shapes.outfits import drawn_outfit, stockinged
 from workflows.avatar.animate import poses_of
@@ -197,7 +200,9 @@ def test_from_scans_to_an_animation(recipe: Path, tmp_path: Path) -> None:
     done = command(*words)
     assert done.returncode == 0, done.stderr
     assert (
-        "| unseen | avatar |" in done.stdout and (out / "evaluation" / "figures" / "examples.png").stat().st_size > 1e4
+        "| unseen | avatar |" in done.stdout
+        and "| unseen | simulation, finer steps |" in done.stdout
+        and (out / "evaluation" / "figures" / "examples.png").stat().st_size > 1e4
     )
     again = command(*words)
     assert all(
@@ -209,8 +214,30 @@ def test_from_scans_to_an_animation(recipe: Path, tmp_path: Path) -> None:
     walk = command("avatar", "animate", str(out), "-o", str(tmp_path / "walk.glb"), "--stations", "2")
     assert walk.returncode == 0, walk.stderr
     assert len(trimesh.load(tmp_path / "walk.glb").geometry) == 1
+    person = _person(tmp_path / "person.obj")
+    like = command("avatar", "animate", str(out), "-o", str(tmp_path / "like.glb"), "--source", str(person))
+    assert like.returncode == 0 and (tmp_path / "like.glb").stat().st_size > 1000, like.stderr
+    nobody = command(
+        "avatar", "animate", str(out), "-o", str(tmp_path / "no.glb"), "--source", str(tmp_path / "no.obj")
+    )
+    assert nobody.returncode != 0 and "no mesh file or folder at" in nobody.stderr
     wrong = command("avatar", "animate", str(out), "--outfit", "coat", "-o", str(tmp_path / "walk.glb"))
     assert wrong.returncode != 0 and "has the outfits skirt: there is no outfit 'coat' in it" in wrong.stderr
+
+
+def _person(path: Path) -> Path:
+    """A file of a bare person in a random pose."""
+    body = load_body(AnnyBody(topology="notoes_collapse5pc"))
+    who = body.draw_identity(generator(7, Stream.IDENTITY, 0), 0)
+    trimesh.Trimesh(body.vertices(who, draw_poses(PoseRecipe(), [1]))[0], body.faces(who), process=False).export(path)
+    return path
+
+
+def test_poses_are_of_a_file_or_of_people(tmp_path: Path) -> None:
+    folder = AvatarFolder(tmp_path)
+    folder.recipe.touch()
+    with pytest.raises(RecipeError, match=r"--poses and --source both say what to play: name one"):
+        poses_of(folder, tmp_path / "poses.npz", tmp_path / "person.obj", count=9, seed=0)
 
 
 def test_an_animation_is_a_glb(tmp_path: Path) -> None:

@@ -1,0 +1,81 @@
+"""The poses of meshes, read off them by the parts network: rotations of joints, by which other bodies can be posed."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datagen.common.arrays import Floats
+from datagen.common.errors import CheckpointError, MeshError
+from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
+from training.inference.predict import load_trained, surfaces_of
+from training.inference.standing import STRANGE, facing, misfit, standing, understanding_of
+from training.networks.layers.sampling import sample
+from training.networks.parts import Parts
+
+
+class PosesRead(NamedTuple):
+    """Axis-angle ``rotations`` [mesh, joint, 3] in radians over the tree of ``joints`` and ``parents``.
+
+    The members of :class:`datagen.poses.Poses`, in their order.
+    """
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    rotations: NDArray[np.float64]
+
+
+def read_poses(weights: Path, meshes: Iterable[Mesh]) -> PosesRead:
+    """The pose of each mesh, over the joints that the network of ``weights`` tells apart.
+
+    How the first one stands is found, and which way each faces. The root's place is not read: a body posed so stays
+    where it stands.
+
+    Raises
+    ------
+    CheckpointError
+        There are no such weights, or they are those of another network than ``parts``.
+    MeshError
+        A mesh cannot be used, or is no body that the network knows.
+    """
+    network = load_trained(weights)[0]
+    if not isinstance(network, Parts):
+        raise CheckpointError(f"{weights} holds no weights of network 'parts', which reads poses off meshes")
+    parents = [-1 if parent == part else parent for part, parent in enumerate(network.parents.tolist())]
+    world = np.stack(list(_world_rotations(network, meshes)))
+    return PosesRead(network.joints, tuple(parents), local_rotations(world, parents))
+
+
+def local_rotations(world: Floats, parents: Iterable[int]) -> NDArray[np.float64]:
+    """Axis-angles [pose, joint, 3] relative to the parent, of world rotations [pose, joint, 3, 3].
+
+    The inverse of :func:`datagen.mesh.rig.world_rotations`.
+    """
+    turns = [world[:, own] if parent < 0 else world[:, parent].swapaxes(1, 2) @ world[:, own]
+             for own, parent in enumerate(parents)]  # fmt: skip
+    found = np.stack(turns, axis=1)
+    return Rotation.from_matrix(found.reshape(-1, 3, 3)).as_rotvec().reshape(*found.shape[:2], 3)
+
+
+@torch.no_grad()
+def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray[np.float64]]:
+    """Rotations [part, 3, 3] of each mesh, Y up, facing +Z at rest."""
+    understand, axes, turn = understanding_of(network), None, np.eye(3)
+    for number, each in enumerate(meshes):
+        mesh = check_mesh(each, name=f"mesh {number}")
+        axes = axes or standing(understand, mesh.vertices)  # the others may turn round
+        upright = axes.turned(mesh.vertices)
+        turn = facing(understand, upright, turn)
+        ahead = upright @ turn
+        if (left := misfit(understand, ahead)) > STRANGE:
+            raise MeshError(
+                f"mesh {number} is no body whose pose these weights know (misfit {left:.3f}, more than {STRANGE})"
+            )
+        vertices = torch.from_numpy(bounding_box(ahead).normalise(ahead).astype(np.float32))[None]
+        surface = surfaces_of(network, sources=[mesh], targets=[mesh])["source_surface"]
+        drawn = sample(vertices, surface)
+        yield turn @ network.read(drawn.vertices, drawn).rotations[0].double().numpy()
