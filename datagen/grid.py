@@ -115,7 +115,7 @@ class Grid:
 
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
-        return [number for number, its in enumerate(self._splits) if its == split]
+        return [number for number, each in enumerate(self._splits) if each == split]
 
     def pose_type(self, pose: int) -> PoseType:
         """Whether pose number ``pose`` occurs in training."""
@@ -123,7 +123,7 @@ class Grid:
 
     def poses(self, pose_type: PoseType) -> NDArray[np.int64]:
         """Pose numbers of a type, in order."""
-        return np.flatnonzero([its == pose_type for its in self._pose_types])
+        return np.flatnonzero([each == pose_type for each in self._pose_types])
 
     def poses_of(self, identity: int) -> NDArray[np.int64]:
         """Pose numbers that this identity is made in, ascending."""
@@ -131,7 +131,7 @@ class Grid:
 
     @cached_property
     def _poses_in(self) -> dict[Split, NDArray[np.int64]]:
-        return {split: np.concatenate([np.arange(*its) for its in self.pose_spans(split)]) for split in SPLITS}
+        return {split: np.concatenate([np.arange(*span) for span in self.pose_spans(split)]) for split in SPLITS}
 
     def identity_spans(self, split: Split) -> list[tuple[int, int]]:
         """Identity numbers [first, end) of a split that each step adds."""
@@ -261,8 +261,8 @@ class GridArray:
         poses = [_without_holes(self.poses[start : start + width]) for start in range(0, len(self.poses), width)]
         for row, start in enumerate(range(0, len(self.identities), height)):
             members = tuple(_without_holes(self.identities[start : start + height]))
-            for column, its in enumerate(poses):
-                span = range(its[0], its[-1] + 1)
+            for column, held in enumerate(poses):
+                span = range(held[0], held[-1] + 1)
                 yield Shard(self.place(row, column), members, span, self.vertices, self.room)
 
     def places(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -301,7 +301,9 @@ class GridArrays:
             for first, end in grid.identity_spans(split):
                 for topology, identities in _by_value(self.topologies[first:end]):
                     members.setdefault((number, topology), []).append(first + identities)
-        self.arrays = [self._array(SPLITS[split], its, steps) for (split, its), steps in sorted(members.items())]
+        self.arrays = [
+            self._array(SPLITS[split], topology, steps) for (split, topology), steps in sorted(members.items())
+        ]
 
     def _array(self, split: Split, topology: int, identities: list[NDArray[np.int64]]) -> GridArray:
         vertices = self.vertices[topology]
@@ -339,7 +341,7 @@ def _by_value(values: NDArray[np.int32]) -> list[tuple[int, NDArray[np.int64]]]:
     """Each value that occurs, and where."""
     order = np.argsort(values, kind="stable")
     places = np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
-    return [(int(values[its[0]]), its) for its in places if len(its)]
+    return [(int(values[alike[0]]), alike) for alike in places if len(alike)]
 
 
 def _with_holes(steps: Sequence[NDArray[np.int64]], size: int) -> NDArray[np.int32]:

@@ -76,10 +76,10 @@ def _counts(meshes: FoundMeshes) -> Counts:
 
 def _ragged(meshes: FoundMeshes) -> tuple[FoundMeshes, Counts]:
     """Identities with fewer poses, then those with all; the poses that all have, then the others."""
-    whole = [its for its in meshes.identities if len(meshes.poses_of(its)) == len(meshes.poses)]
-    fewer = [its for its in meshes.identities if its not in whole]
+    whole = [identity for identity in meshes.identities if len(meshes.poses_of(identity)) == len(meshes.poses)]
+    fewer = [identity for identity in meshes.identities if identity not in whole]
     common = meshes.poses_of(fewer[0])
-    if len(fewer) < 2 or not whole or any(meshes.poses_of(its) != common for its in fewer):
+    if len(fewer) < 2 or not whole or any(meshes.poses_of(identity) != common for identity in fewer):
         identity = meshes.identities.index(fewer[0])
         pose = next(n for n, name in enumerate(meshes.poses) if name not in common)
         meshes.path(identity, pose)  # raises, naming the file
@@ -102,8 +102,8 @@ def require_files(recipe: DatasetRecipe) -> None:
     grid = Grid(recipe)
     for place, body in enumerate(bodies):
         if isinstance(body, ImportedBody):
-            its = range(place, grid.identity_count, len(bodies))  # identities of a mixed body take turns
-            _require_cells(find_meshes(body), [grid.poses_of(identity).tolist() for identity in its])
+            own = range(place, grid.identity_count, len(bodies))  # identities of a mixed body take turns
+            _require_cells(find_meshes(body), [grid.poses_of(identity).tolist() for identity in own])
     if isinstance(recipe.body, ImportedBody) and recipe.body.test_list:
         evaluation_lists(grid)
 

@@ -149,7 +149,7 @@ def _require_free(size: DatasetSize) -> None:
     needed, free = sum(size.memory.values()), free_memory()
     if needed > free:
         largest = max(size.memory, key=lambda key: size.memory[key])
-        reason = next((key for key, its in size.memory.items() if its > free), largest)
+        reason = next((key for key, bytes_needed in size.memory.items() if bytes_needed > free), largest)
         raise RecipeError(
             f"making {size.meshes:,} meshes takes about {bytes_text(needed)} of memory, but {bytes_text(free)} are "
             f"free. Lower {reason}"

@@ -85,7 +85,7 @@ class FoundMeshes:
                 )
 
     def _file_name(self, identity: str, pose: str) -> str:
-        like = next(path for (its, _), path in self.files.items() if its == identity)
+        like = next(path for (owner, _), path in self.files.items() if owner == identity)
         if self.layout == "faust":
             return _faust_name(identity, pose)
         match = _NPT.fullmatch(like.name)

@@ -36,7 +36,7 @@ class RiggedModel:
         self._stretchable = [Stretchable(character) for character in self._characters]
         found = {part for each in self._stretchable for part in each.parts}
         self.parameter_names = (
-            _CHARACTER, *(name for name, its in _FACTORS.items() if found.intersection(its.split())),
+            _CHARACTER, *(name for name, names in _FACTORS.items() if found.intersection(names.split())),
         )  # fmt: skip
         self.joints = shared_joints(self._characters)[0]
         self.assets = tuple(dict.fromkeys(asset for character in self._characters for asset in character.assets))

@@ -46,9 +46,9 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
     parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
     topologies = _Topologies(recipe, body)
     table, numbers, rig_numbers = RigCollection(), [], []
-    for identity, its in enumerate(parameters):  # all of a person at once, who may be dear to make
-        numbers.append(topologies.number_of(identity, its))
-        rig_numbers.append(table.add(body.rig(its, source.joints)))
+    for identity, parameter in enumerate(parameters):  # all of a person at once, who may be dear to make
+        numbers.append(topologies.number_of(identity, parameter))
+        rig_numbers.append(table.add(body.rig(parameter, source.joints)))
     labelled = {"labelled": list(topologies.labels)} if topologies.labels else {}
     return Plan(
         attributes={**_attributes(recipe, body, source), "rigs": table.parts, **labelled},

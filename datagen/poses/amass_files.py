@@ -83,7 +83,7 @@ def _frame_count(path: Path, headers: list[Header]) -> int:
             )
     shapes = [shape for shape, _ in headers]
     flat = all(len(shape) == 2 and shape[0] == shapes[0][0] for shape in shapes)
-    shape = (shapes[0][0], sum(its[1] for its in shapes)) if flat else shapes[0]
+    shape = (shapes[0][0], sum(size[1] for size in shapes)) if flat else shapes[0]
     if not flat or not shape[0] or shape[1] not in JOINTS_OF_WIDTH:
         raise RecipeError(
             f"{path}: poses have shape {shape}; known are frames of {', '.join(map(str, JOINTS_OF_WIDTH))} "

@@ -153,7 +153,7 @@ class ClothedBody(BodySection):
 
     @model_validator(mode="after")
     def _makes_sense(self) -> Self:
-        known = [*(its.name for its in self.own), *OUTFITS]
+        known = [*(outfit.name for outfit in self.own), *OUTFITS]
         for name, count in Counter(known).items():
             if count > 1:
                 what = "that comes with the project" if name in OUTFITS else "called so, too"
@@ -171,7 +171,7 @@ class ClothedBody(BodySection):
 
     def outfit(self, number: int) -> tuple[Part, ...]:
         """The parts of an outfit by its number among ``outfits``."""
-        own: dict[str, tuple[Part, ...]] = {its.name: its.parts for its in self.own}
+        own: dict[str, tuple[Part, ...]] = {outfit.name: outfit.parts for outfit in self.own}
         return (dict(OUTFITS) | own)[self.outfits[number]]
 
     @property

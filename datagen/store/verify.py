@@ -183,7 +183,7 @@ def _rigs(rigs: Sequence[Mapping[str, Any]]) -> str:
         return ""
     parts = rigs[0]
     tree = ", ".join(_tree(parts["names"], parts["parents"], -1))
-    counts = ", ".join(str(len(its["names"])) for its in rigs[1:])
+    counts = ", ".join(str(len(rig["names"])) for rig in rigs[1:])
     more = f"; other rigs of {counts} parts" if counts else ""
     return f"{len(parts['names'])} parts: {tree}{more}"
 
@@ -199,10 +199,10 @@ def _clothes(dataset: Dataset, arrays: GridArrays | None) -> str:
     if not dataset.attributes.get("labelled") or arrays is None:
         return ""
     labels = [dataset.part(identity) for identity in range(len(arrays.topologies))]
-    counts = [np.bincount(its) for its in labels if its is not None]
+    counts = [np.bincount(label) for label in labels if label is not None]
     words = [f"{len(counts)} identities are dressed"]
-    for parts in sorted({len(its) for its in counts}):
-        alike = np.array([its for its in counts if len(its) == parts])
+    for parts in sorted({len(count) for count in counts}):
+        alike = np.array([count for count in counts if len(count) == parts])
         spans = (f"{low:,}" if low == high else f"{low:,} to {high:,}"
                  for low, high in zip(alike.min(axis=0).tolist(), alike.max(axis=0).tolist(), strict=True))  # fmt: skip
         named = ", ".join(f"{part_name(part)} {span}" for part, span in enumerate(spans))

@@ -211,7 +211,7 @@ def fingerprint_of(checkpoint: Checkpoint) -> str:
 
 def _hashes(weights: Path) -> dict[str, str]:
     if weights.is_dir():
-        return {name: its for name, its in manifest_of(weights)["sha256"].items() if name in (WEIGHTS, AVERAGE)}
+        return {name: digest for name, digest in manifest_of(weights)["sha256"].items() if name in (WEIGHTS, AVERAGE)}
     return {WEIGHTS: sha256_of(weights)}
 
 
@@ -220,10 +220,10 @@ def _pieces(dataset: Dataset, contenders: Sequence[Contender], recipe: Evaluatio
     for pose_type in POSE_TYPES:
         listed = evaluation_list(dataset, recipe, pose_type)
         unable = [name for name, is_able in _CAN_STAND.items() if not is_able(dataset, listed)]
-        able = [its for its in contenders if its.name not in unable]
+        able = [method for method in contenders if method.name not in unable]
         for start in range(0, len(listed), recipe.chunk):
             triples = listed[start : start + recipe.chunk]
-            pieces += [_piece(dataset, its, recipe, pose_type, start, triples) for its in able]
+            pieces += [_piece(dataset, method, recipe, pose_type, start, triples) for method in able]
     return pieces
 
 

@@ -127,7 +127,7 @@ def takes(method: LoadedMethod, cases: Sequence[Case]) -> bool:
 
 def _scores(method: LoadedMethod, cases: Sequence[Case]) -> list[Score]:
     pairs = ((case.source, case.target) for case in cases)
-    return [case.score(its) for case, its in zip(cases, transfer_each(method.network, pairs), strict=True)]
+    return [case.score(output) for case, output in zip(cases, transfer_each(method.network, pairs), strict=True)]
 
 
 def _rows(key: tuple[str, str, str], cases: Sequence[Case], scores: Sequence[Score]) -> list[GeneralisationRow]:
@@ -138,9 +138,9 @@ def _rows(key: tuple[str, str, str], cases: Sequence[Case], scores: Sequence[Sco
             *case.triple,
             len(case.source.vertices),
             len(case.target.vertices),
-            **asdict(its),
+            **asdict(scored),
         )
-        for case, its in zip(cases, scores, strict=True)
+        for case, scored in zip(cases, scores, strict=True)
     ]
 
 

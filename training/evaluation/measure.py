@@ -75,7 +75,7 @@ def _measured(
     contenders: Sequence[Contender], dataset: Dataset, recipe: EvaluationRecipe, pose_type: PoseType, start: int
 ) -> list[Row]:
     triples = evaluation_list(dataset, recipe, pose_type)[start : start + recipe.chunk]
-    told = any(takes_surfaces(_network_of(its)) for its in contenders if its.name not in CONTROLS)
+    told = any(takes_surfaces(_network_of(method)) for method in contenders if method.name not in CONTROLS)
     batch, groups = read_batch(dataset, triples, padded=True, surfaces=told), _groups(dataset, triples)
     return [
         Row(contender.name, pose_type, start + place, *map(int, triples[place]), *astuple(score), *astuple(dressed))
@@ -153,11 +153,11 @@ def _measure_each(
 ) -> list[tuple[Score, Dressed]]:
     """Metrics of each triple over its target's own vertices and faces; rows after its count are padding."""
     found: dict[int, tuple[Score, Dressed]] = {}
-    for its in groups:
-        ours, right = output[its.places, : its.count], truth[its.places, : its.count]
+    for group in groups:
+        ours, right = output[group.places, : group.count], truth[group.places, : group.count]
         about: dict[str, Any] = {"emd_points": recipe.emd_points, "seed": recipe.seed}
-        scores = measure(ours, right, edges=its.edges, faces=its.faces, metres=its.metres, **about)
-        found |= zip(its.places, zip(scores, _by_part(its, ours, right), strict=True), strict=True)
+        scores = measure(ours, right, edges=group.edges, faces=group.faces, metres=group.metres, **about)
+        found |= zip(group.places, zip(scores, _by_part(group, ours, right), strict=True), strict=True)
     return [found[place] for place in range(len(found))]
 
 

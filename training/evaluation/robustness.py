@@ -166,8 +166,8 @@ def _rows(
     key: tuple[str, str, float], cases: Sequence[Case], counts: Sequence[int], scores: Sequence[Score]
 ) -> list[RobustnessRow]:
     return [
-        RobustnessRow(*key, case.number, *case.triple, count, **asdict(its))
-        for case, count, its in zip(cases, counts, scores, strict=True)
+        RobustnessRow(*key, case.number, *case.triple, count, **asdict(scored))
+        for case, count, scored in zip(cases, counts, scores, strict=True)
     ]
 
 

@@ -42,8 +42,8 @@ def mean_and_interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 def differences(rows: Sequence[Row], *, method: str, reference: str, pose_type: str, field: str) -> list[float]:
     """The method's values minus the reference's, over the triples of both."""
-    ours, its = (values_of(rows, method=name, pose_type=pose_type, field=field) for name in (method, reference))
-    return [ours[triple] - its[triple] for triple in ours if triple in its]
+    ours, theirs = (values_of(rows, method=name, pose_type=pose_type, field=field) for name in (method, reference))
+    return [ours[triple] - theirs[triple] for triple in ours if triple in theirs]
 
 
 def spread_over(rows: Iterable[Row]) -> PoseType:

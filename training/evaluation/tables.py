@@ -177,9 +177,9 @@ def table_2(inference: Mapping[str, Inference]) -> Table:
     """The paper's Table 2: size of the weights in float32 and time of one pair, ours and, marked, theirs below."""
     lines = [["method", "numbers", "size KiB", "parameters", "mean s a pair", "median s", "fastest to slowest"]]
     for name in _in_papers_order(inference):
-        its = inference[name]
-        times = [f"{its.mean:.4f}", f"{its.seconds:.4f}", f"{its.fastest:.4f} to {its.slowest:.4f}"]
-        lines.append([name, "ours", f"{its.kilobytes:,.0f}", f"{its.parameters:,}", *times])
+        measured = inference[name]
+        times = [f"{measured.mean:.4f}", f"{measured.seconds:.4f}", f"{measured.fastest:.4f} to {measured.slowest:.4f}"]
+        lines.append([name, "ours", f"{measured.kilobytes:,.0f}", f"{measured.parameters:,}", *times])
         if name in paper.TABLE_2:
             theirs = paper.TABLE_2[name]
             label = f"{THEIRS}, {paper.INFERENCE_DEVICE}"
@@ -189,12 +189,12 @@ def table_2(inference: Mapping[str, Inference]) -> Table:
 
 def _timing_note(inference: Mapping[str, Inference]) -> str:
     """On what ours was measured, and that theirs is of another machine."""
-    its = next(iter(inference.values()))
-    threads = f"{its.threads} thread{'s' if its.threads > 1 else ''}"
+    first = next(iter(inference.values()))
+    threads = f"{first.threads} thread{'s' if first.threads > 1 else ''}"
     return (
-        f"Ours: mean and median of {its.rounds} rounds in which the networks took turns, on one pair of "
-        f"{its.source_vertices:,} (source) and {its.target_vertices:,} (target) vertices in float32 on "
-        f"{its.device} with {threads}; weights loaded, kernels warm. Lines marked "
+        f"Ours: mean and median of {first.rounds} rounds in which the networks took turns, on one pair of "
+        f"{first.source_vertices:,} (source) and {first.target_vertices:,} (target) vertices in float32 on "
+        f"{first.device} with {threads}; weights loaded, kernels warm. Lines marked "
         f" '{THEIRS}' are the paper's own, on an {paper.INFERENCE_DEVICE} GPU: "
         "another machine, so that only the order and the ratios of times can be compared."
     )
@@ -228,13 +228,13 @@ def _comparison(
 ) -> list[list[str]]:
     """Heading and lines of Tables 1 and 3; ``more``: further fields, on the pose type of the spread."""
     pose_type, reference = spread_over(rows), _reference(methods)
-    shown = [(its, name) for its in POSE_TYPES for name in _PAPERS_COLUMNS] + [(pose_type, name) for name in more]
-    columns = [(its, next(column for column in COLUMNS if column.field == name)) for its, name in shown]
-    headings = [f"{its} {column.heading.split()[0]}" for its, column in columns]
+    shown = [(kind, name) for kind in POSE_TYPES for name in _PAPERS_COLUMNS] + [(pose_type, name) for name in more]
+    columns = [(kind, next(column for column in COLUMNS if column.field == name)) for kind, name in shown]
+    headings = [f"{kind} {column.heading.split()[0]}" for kind, column in columns]
     spreads = [f"{pose_type} PMD, 95 %", f"minus {reference}'s, 95 %"]
     lines = [["method", "numbers", *headings, *spreads]]
     for method in _in_papers_order(methods):
-        cells = [_mean(rows, method, its, column) for its, column in columns]
+        cells = [_mean(rows, method, kind, column) for kind, column in columns]
         cells += [_interval(_pmd(rows, method, pose_type)), _difference(rows, method, reference, pose_type)]
         lines.append([method, _kind(method), *cells])
         if _short(method) in theirs:
@@ -247,7 +247,7 @@ def _kind(method: str) -> str:
 
 
 def _cells(scores: paper.SeenUnseen) -> list[str]:
-    return [f"{getattr(its, name):.2f}" for its in (scores.seen, scores.unseen) for name in _PAPERS_COLUMNS]
+    return [f"{getattr(mean, name):.2f}" for mean in (scores.seen, scores.unseen) for name in _PAPERS_COLUMNS]
 
 
 def _short(method: str) -> str:

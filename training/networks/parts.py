@@ -169,13 +169,15 @@ class Parts(nn.Module):
         with full_precision(vertices):
             drawn = sample(vertices)
             reading = self.read(drawn.vertices, drawn)
-            its = _moments(reading, drawn)
-            fits = (reading.rotations * its.crossed).sum((2, 3))
-            fit, rest, all_of_it = ((its.mass * each).sum(1) for each in (fits, its.squares_at_rest, its.squares))
+            moments = _moments(reading, drawn)
+            fits = (reading.rotations * moments.crossed).sum((2, 3))
+            fit, rest, all_of_it = (
+                (moments.mass * each).sum(1) for each in (fits, moments.squares_at_rest, moments.squares)
+            )
             misfit = all_of_it - fit.clamp_min(0).square() / rest.clamp_min(1e-12)
             root = reading.rotations[:, 0]
             facing = torch.atan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2])
-            return misfit / its.mass.sum(1).clamp_min(1e-12), facing
+            return misfit / moments.mass.sum(1).clamp_min(1e-12), facing
 
     def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Return the weights [b, n, part] by which vertices [b, n, 3] are posed, more certain than as they are read."""

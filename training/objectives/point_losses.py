@@ -118,7 +118,7 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor:
 
     By k-d trees on the CPU: it takes n log n time, and no gradient. What is not finite is taken to lie at the origin.
     """
-    asked, there = (np.nan_to_num(its.detach().cpu().numpy(), posinf=0, neginf=0) for its in (queries, points))
+    asked, there = (np.nan_to_num(tensor.detach().cpu().numpy(), posinf=0, neginf=0) for tensor in (queries, points))
     return torch.from_numpy(cKDTree(there).query(asked)[1]).to(queries.device)
 
 

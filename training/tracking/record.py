@@ -149,8 +149,8 @@ def find_records(root: Path) -> list[Path]:
     records = {folder.resolve(): read_record(folder) for folder in _with_records(root)}
     for folder, record in list(records.items()):
         parent = parent_of(folder, record) if record else None
-        if parent and parent not in records and (its := read_record(parent)):
-            records[parent] = its
+        if parent and parent not in records and (above := read_record(parent)):
+            records[parent] = above
     return sorted(records, key=lambda folder: _rank(records[folder]))
 
 

@@ -265,9 +265,9 @@ def _base64(array: npt.NDArray[Any]) -> str:
 def _printable(value: Any) -> Any:
     """Return a payload whose texts, names among the keys too, can be shown."""
     if isinstance(value, dict):
-        return {printable(key): _printable(its) for key, its in value.items()}
+        return {printable(key): _printable(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_printable(its) for its in value]
+        return [_printable(item) for item in value]
     return printable(value) if isinstance(value, str) else value
 
 

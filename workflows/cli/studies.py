@@ -224,7 +224,7 @@ def _robustness_options(made: Parser) -> None:
     from training.evaluation.disturbances import DISTURBANCES
 
     _weights_options(made)
-    add, known = made.add_argument, ", ".join(its.name for its in DISTURBANCES)
+    add, known = made.add_argument, ", ".join(disturbance.name for disturbance in DISTURBANCES)
     add("--data", required=True, metavar="X.zarr", help="a complete dataset with evaluation triples")
     add("--triples", type=int, default=40, metavar="N", help="evaluation triples (default 40)")
     add("--only", nargs="+", metavar="NAME", help=f"some of {known}")
@@ -251,7 +251,7 @@ def _generalisation_options(made: Parser) -> None:
 
     _weights_options(made)
     sizes, add = Sizes(), made.add_argument
-    known = tuple(its for its in get_args(AnnyTopology) if its != "makehuman")
+    known = tuple(topology for topology in get_args(AnnyTopology) if topology != "makehuman")
     add(
         "--topologies", nargs="+", choices=known, default=list(TOPOLOGIES), metavar="NAME",
         help=f"Anny's meshes to make (default: all of {', '.join(TOPOLOGIES)})",

@@ -234,8 +234,8 @@ def describe_fields(
             names = ", ".join(known_trainings())
             yield f"  {prefix}{name} = NAME\n      a published recipe in place of the whole section: {names}"
         for section in [kind for kind in sections if isinstance(value, kind)] or sections:
-            its = value if isinstance(value, section) else None
-            yield from describe_fields(section, f"{prefix}{name}.", recipe=its)
+            own = value if isinstance(value, section) else None
+            yield from describe_fields(section, f"{prefix}{name}.", recipe=own)
         if not sections:
             default: Any = value if recipe else field.get_default(call_default_factory=True)
             default = f"a training of {default.network.name!r}" if isinstance(default, TrainingRecipe) else default

@@ -42,7 +42,7 @@ def weights_of(options: argparse.Namespace) -> list[Evaluated]:
 
 def methods_of(weights: Sequence[Evaluated]) -> list[LoadedMethod]:
     """Their networks, named after their networks and, where that is not unique, their folders."""
-    return load_methods([its.weights for its in weights], labels=[_shown(its) for its in weights])
+    return load_methods([each.weights for each in weights], labels=[_shown(each) for each in weights])
 
 
 def _shown(weights: Evaluated) -> str:
@@ -86,7 +86,7 @@ def parent_of(weights: Sequence[Evaluated]) -> Path | None:
 
 def about_weights(weights: Sequence[Evaluated]) -> list[str]:
     """What tells these weights from all others, wherever they lie, as plain data."""
-    return [f"step {its.checkpoint.step} {fingerprint_of(its.checkpoint)}" for its in weights]
+    return [f"step {each.checkpoint.step} {fingerprint_of(each.checkpoint)}" for each in weights]
 
 
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:

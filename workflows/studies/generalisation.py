@@ -66,7 +66,7 @@ class GeneralisationStudy(Study[GeneralisationRow]):
         made = make_kinds(base, options.topologies, options.others, self.folder / "data", sizes, say=say)
         self.kinds = _named_apart([*made, *extra])
         self.names = [kind.name for kind in self.kinds]
-        self.trained = [_trained(its, self.kinds) for its in self.weights]
+        self.trained = [_trained(each, self.kinds) for each in self.weights]
         self.settings = {
             "weights": about_weights(self.weights),
             "methods": [method.name for method in self.methods],
@@ -92,7 +92,7 @@ class GeneralisationStudy(Study[GeneralisationRow]):
             if row.method != NO_OP:
                 where = "within" if row.source_kind == row.target_kind else "between"
                 values.setdefault(f"pmd/{where}/{metric_name(row.method)}", []).append(row.pmd * 1e4)
-        return {name: sum(its) / len(its) for name, its in values.items()}
+        return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
 
     def report(self, rows: list[GeneralisationRow]) -> str:
         """What was done, and a grid of each method."""
@@ -153,7 +153,7 @@ def examples(kinds: Sequence[MeshKind], trained: str) -> list[Shown]:
     """Transfers to draw: to and from every other kind in turn, and, where truth lies in a kind alone, within it."""
     own = next(kind for kind in kinds if kind.name == trained)
     found = []
-    for number, kind in enumerate(its for its in kinds if its is not own):
+    for number, kind in enumerate(each for each in kinds if each is not own):
         if have_truth(own, kind):
             pairs = [(own, kind) if number % 2 == 0 else (kind, own)]
         else:

@@ -68,8 +68,8 @@ def animals_recipe(sizes: Sizes) -> DatasetRecipe:
 
 def human_poses(base: DatasetRecipe, sizes: Sizes) -> PoseRecipe:
     """New draws of the recipe's poses, or of NPT's where its own are of other joints."""
-    its = base.poses.distribution
-    distribution = its if its.name in _OF_HUMANS else NptPoses()
+    own = base.poses.distribution
+    distribution = own if own.name in _OF_HUMANS else NptPoses()
     return PoseRecipe(seen=sizes.poses, unseen=0, distribution=distribution, seed=sizes.seed)
 
 

@@ -41,7 +41,7 @@ from workflows.studies.common import (
     weights_of,
 )
 
-_KNOWN = tuple(its.name for its in DISTURBANCES)
+_KNOWN = tuple(disturbance.name for disturbance in DISTURBANCES)
 
 
 def robustness_command(options: argparse.Namespace) -> None:
@@ -76,12 +76,12 @@ class RobustnessStudy(Study[RobustnessRow]):
             "dataset": dataset.uuid,
             "triples": len(self.cases),
             "emd_points": options.emd_points,
-            "amounts": {its.name: list(its.amounts) for its in DISTURBANCES},
+            "amounts": {disturbance.name: list(disturbance.amounts) for disturbance in DISTURBANCES},
         }
 
     def measure(self, done: list[RobustnessRow]) -> Iterable[list[RobustnessRow]]:
         there = {row.key for row in done}
-        asked = [(its[1].name, its[0].name, its[2]) for its in steps(self.methods, self.disturbances)]
+        asked = [(step[1].name, step[0].name, step[2]) for step in steps(self.methods, self.disturbances)]
         missing = sum(key not in there for key in [(NO_OP, "", 0.0), *asked])
         found = measured(self.methods, self.cases, self.disturbances, emd_points=self.emd_points, done=done)
         return bar(found, total=missing, what="robustness", unit="amount")
@@ -99,15 +99,15 @@ class RobustnessStudy(Study[RobustnessRow]):
     def metrics(self, rows: list[RobustnessRow]) -> dict[str, float]:
         """PMD (1e-4) at the most of each disturbance: ``pmd/NOISE/METHOD``."""
         curves = {
-            f"pmd/{its.name}/{metric_name(method.name)}": curve(rows, method.name, its.name)
+            f"pmd/{disturbance.name}/{metric_name(method.name)}": curve(rows, method.name, disturbance.name)
             for method in self.methods
-            for its in DISTURBANCES
+            for disturbance in DISTURBANCES
         }
         return {name: levels[-1].mean * 1e4 for name, levels in curves.items() if levels}
 
     def report(self, rows: list[RobustnessRow]) -> str:
         """What was done, where it breaks, every number."""
-        start = ", ".join(f"{plain(its.name)} {_undisturbed(rows, its):.2f}" for its in self.methods)
+        start = ", ".join(f"{plain(method.name)} {_undisturbed(rows, method):.2f}" for method in self.methods)
         trained = "; ".join(f"{plain(method.name)}: step {method.step:,}" for method in self.methods)
         about = (
             f"Weights: {trained}. Dataset {plain(self.data)}, its first {len(self.cases)} "
@@ -128,7 +128,7 @@ def _asked(options: argparse.Namespace) -> list[Disturbance]:
         raise RecipeError(f"--only {unknown[0]}: there is no such disturbance. Choose from {', '.join(_KNOWN)}")
     if options.triples < 1 or options.emd_points < 0:
         raise RecipeError(f"--triples {options.triples} --emd-points {options.emd_points}: use 1 and 0 or more")
-    return [its for its in DISTURBANCES if not options.only or its.name in options.only]
+    return [disturbance for disturbance in DISTURBANCES if not options.only or disturbance.name in options.only]
 
 
 def _example(options: argparse.Namespace, cases: Sequence[Case]) -> Case:
@@ -139,11 +139,11 @@ def _example(options: argparse.Namespace, cases: Sequence[Case]) -> Case:
 
 def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
     """A line that says what a method could not take, and why."""
-    refused = [its for its in disturbances if refusal(method, its)]
-    names = ", ".join(its.heading.lower() for its in refused)
+    refused = [disturbance for disturbance in disturbances if refusal(method, disturbance)]
+    names = ", ".join(disturbance.heading.lower() for disturbance in refused)
     return f"- {plain(method.name)} without {names}: {refusal(method, refused[0])}.\n\n" if refused else ""
 
 
 def _undisturbed(rows: Sequence[RobustnessRow], method: LoadedMethod) -> float:
-    levels = [curve(rows, method.name, its.name) for its in DISTURBANCES]
-    return next(its[0].mean * 1e4 for its in levels if its)
+    levels = [curve(rows, method.name, disturbance.name) for disturbance in DISTURBANCES]
+    return next(curve_levels[0].mean * 1e4 for curve_levels in levels if curve_levels)

@@ -305,7 +305,7 @@ class GlbContent(Alone):
         own: dict[int, list[Json]] = {node: [] for node in self._nodes}
         for piece, primitive in zip(self._pieces, primitives, strict=True):
             own[piece.node].append(primitive)
-        parts.json["meshes"] = [self._own_mesh(node, its) for node, its in own.items()]
+        parts.json["meshes"] = [self._own_mesh(node, block) for node, block in own.items()]
         parts.json["nodes"] = [self._stripped(number, node) for number, node in enumerate(self._file.nodes)]
         if "images" in self._file.json:
             parts.json["images"] = [self._copied_image(image, parts) for image in self._file.json["images"]]

@@ -32,9 +32,9 @@ def parts_draft(faces: NDArray[np.int64], part: NDArray[np.integer], materials: 
         blocks.append(Block(vertices, [{"attributes": {}, "indices": parts.indices(corners), "material": number}]))
     parts.json |= {
         "materials": _materials(tuple(materials), parts)[0],
-        "meshes": [{"name": its.name, "primitives": block.primitives}
-                   for its, block in zip(materials, blocks, strict=True)],
-        "nodes": [{"name": its.name, "mesh": number} for number, its in enumerate(materials)],
+        "meshes": [{"name": material.name, "primitives": block.primitives}
+                   for material, block in zip(materials, blocks, strict=True)],
+        "nodes": [{"name": material.name, "mesh": number} for number, material in enumerate(materials)],
         "scenes": [{"nodes": list(range(len(materials)))}],
     }  # fmt: skip
     surface = Surface(faces.ravel(), np.full(len(faces), 3), shading=faces.ravel())

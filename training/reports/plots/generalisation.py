@@ -102,8 +102,12 @@ def generalisation_picture(
     shown: Sequence[Shown], methods: Sequence[LoadedMethod], path: str | os.PathLike[str], *, title: str
 ) -> Path:
     """Draw source, target, each method's output and the ground truth (where known) of transfers, one a row."""
-    columns = ["source\ngives the pose", "target\ngives the identity", *(f"{its.name}\noutput" for its in methods)]
-    page = [Row(its.label, _panels(its, methods)) for its in shown]
+    columns = [
+        "source\ngives the pose",
+        "target\ngives the identity",
+        *(f"{method.name}\noutput" for method in methods),
+    ]
+    page = [Row(one.label, _panels(one, methods)) for one in shown]
     return mesh_grid(page, path, columns=[*columns, "ground truth\n"], title=title, one_scale=False)
 
 

@@ -29,7 +29,7 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
     ValueError
         The rows hold no disturbance.
     """
-    shown = [its for its in DISTURBANCES if any(row.disturbance == its.name for row in rows)]
+    shown = [disturbance for disturbance in DISTURBANCES if any(row.disturbance == disturbance.name for row in rows)]
     if not shown:
         raise ValueError("there are no rows of a disturbance to draw")
     across, down = min(_ABREAST, len(shown)), -(-len(shown) // _ABREAST)
@@ -122,7 +122,7 @@ def disturbance_picture(
             taken = not refusal(method, disturbance)
             panels.append(_output(method, case, source) if taken else "needs as many\nvertices as the target")
         page.append(Row(method.name.replace(" ", "\n", 1), panels))
-    headings = ["", *(_heading(its, amount) for its, amount in chosen)]
+    headings = ["", *(_heading(disturbance, amount) for disturbance, amount in chosen)]
     return mesh_grid(page, path, columns=headings, title=title, one_scale=False)
 
 
@@ -152,7 +152,7 @@ def _count(mesh: Mesh) -> str:
 
 def noise_levels() -> list[tuple[Disturbance, float]]:
     """What the picture like the paper's Figure 9 shows: noise of growing amplitude."""
-    noise = next(its for its in DISTURBANCES if its.name == "noise")
+    noise = next(disturbance for disturbance in DISTURBANCES if disturbance.name == "noise")
     return [(noise, amount) for amount in noise.amounts if amount != 0.01]
 
 
@@ -162,4 +162,4 @@ def one_of_each() -> list[tuple[Disturbance, float]]:
         "patch": 0.3, "side": 0.6, "subset": 0.75, "cells": 0.15, "area": 4, "face": 4, "turn-x": 30, "turn-y": 45,
         "turn-z": 30,
     }  # fmt: skip
-    return [(its, amounts[its.name]) for its in DISTURBANCES if its.name in amounts]
+    return [(disturbance, amounts[disturbance.name]) for disturbance in DISTURBANCES if disturbance.name in amounts]

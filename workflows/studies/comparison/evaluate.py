@@ -77,7 +77,7 @@ def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, 
         rows = evaluate(methods, dataset.url, recipe, tasks=ray_runner, keep=folder.chunks, progress=evaluation_bar)
         write_rows(rows, folder.rows)
         inference = measure_inference(methods, vertices=_first_pair(dataset, recipe), threads=1)
-        values = {name: asdict(its) for name, its in inference.items()}
+        values = {name: asdict(measured) for name, measured in inference.items()}
         write_atomically(folder.inference, json.dumps(values, indent=1).encode())
         text = as_markdown(plan, tables_of(plan, dataset, runs, rows, inference), plan.description)
         write_atomically(folder.tables, text.encode())

@@ -67,7 +67,7 @@ def _trainings(plan: ComparisonPlan) -> dict[str, object]:
 
 
 def _tags(plan: ComparisonPlan, trial: Trial) -> dict[str, str]:
-    return {"method": next(name for name, its in plan.methods.items() if its == trial)}
+    return {"method": next(name for name, method in plan.methods.items() if method == trial)}
 
 
 def _evaluate(plan: ComparisonPlan, folder: ComparisonFolder, runs: Mapping[str, Path]) -> None:

@@ -116,7 +116,10 @@ class TripleFeed:
         places, mine = self._order.places(**self._mine), self._order.batches(first_step=first_step, **self._mine)
         for step, share in enumerate(self._bank.prefetch(mine), first_step):
             parts = zip(share, places, strict=True)
-            yield share, [self._augment(its, self._bank.batch(its), step=step, first=first) for its, first in parts]
+            yield (
+                share,
+                [self._augment(part, self._bank.batch(part), step=step, first=first) for part, first in parts],
+            )
 
 
 class TransferValidation:
