@@ -1,5 +1,7 @@
-"""What data was made from: packages and files, with licence and hash, so that the same bytes can be made again."""
+"""What data was made from: packages and files, with licence and hash, and this code, to make the same bytes again."""
 
+import subprocess
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,3 +34,13 @@ def file_asset(path: Path, *, licence: str, name: str | None = None) -> Asset:
             "in the recipe"
         ) from error
     return Asset(name or path.name, licence, f"sha256:{digest}")
+
+
+def git(*arguments: str) -> str:
+    """Return what git says of the working tree that this code runs from; nothing of an installed copy, a sent job."""
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    with suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(
+            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=10
+        ).stdout.strip()
+    return ""

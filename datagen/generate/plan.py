@@ -1,15 +1,14 @@
 """What a recipe and its assets make of a dataset before its meshes: attributes, small arrays, and where meshes go."""
 
 import importlib.metadata
-import subprocess
 import uuid
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies import BodyModel, load_body, part_labels, require_joints
+from datagen.common.assets import git
 from datagen.common.seeding import Stream, generator
 from datagen.generate.rigs import RigCollection
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
@@ -54,7 +53,7 @@ def plan_of(recipe: DatasetRecipe) -> Plan:
         attributes={**_attributes(recipe, body, source), "rigs": table.parts, **labelled},
         provenance={
             "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
-            "git_commit": _git_commit(),
+            "git_commit": git("rev-parse", "HEAD") or "unknown",
         },
         arrays=GridArrays(grid, numbers, topologies.vertices),
         parameters=np.stack(parameters),
@@ -125,14 +124,3 @@ def _ranges(numbers: NDArray[np.int64]) -> list[list[int]]:
     """Numbers as a few ranges [first, end)."""
     breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
     return [[int(run[0]), int(run[-1]) + 1] for run in np.split(numbers, breaks) if len(run)]
-
-
-def _git_commit() -> str:
-    """Commit of the working tree this code runs from, or 'unknown' (an installed copy, a submitted job)."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=10
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import subprocess
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 from pydantic import ConfigDict, TypeAdapter
 from typing_extensions import TypedDict
 
+from datagen.common.assets import git
 from datagen.common.files import read_json_if_whole, write_atomically
 
 FILE = "provenance.json"
@@ -73,19 +73,10 @@ def this_machine() -> dict[str, str]:
 @cache
 def this_commit() -> str:
     """The commit of the code that is running, and whether files differ from it; "unknown" for an installed copy."""
-    commit = _git("rev-parse", "HEAD")
+    commit = git("rev-parse", "HEAD")
     if not commit:
         return "unknown"
-    return f"{commit} with local changes" if _git("status", "--porcelain", "--untracked-files=no") else commit
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
-    with suppress(OSError, subprocess.SubprocessError):
-        return subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=10
-        ).stdout.strip()
-    return ""
+    return f"{commit} with local changes" if git("status", "--porcelain", "--untracked-files=no") else commit
 
 
 def _processor() -> str:

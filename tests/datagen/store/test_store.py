@@ -210,7 +210,7 @@ def test_provenance_names_what_made_the_part_that_was_there(spoilable: Path, mon
     from datagen.generate import append, plan
 
     before = open_dataset(str(spoilable)).attributes["provenance"]
-    monkeypatch.setattr(plan, "_git_commit", lambda: "another")
+    monkeypatch.setattr(plan, "git", lambda *_: "another")
     after = append(str(spoilable), training=4).attributes["provenance"]
     assert after["git_commit"] == "another" and after["earlier"] == [before]
 
