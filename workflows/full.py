@@ -155,7 +155,8 @@ def _evaluate(recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner
     table = evaluate_weights(recipe.evaluation, folder.data, folder.run.path, parent=out, tasks=tasks, beside=beside)
     parent, child = read_record(out), read_record(evaluation.path)
     assert parent is not None and child is not None
-    shown = [os.path.relpath(path, out) for path in (evaluation.tables, evaluation.viewer, evaluation.figures)]
+    pictures = evaluation.examples, evaluation.curve
+    shown = [os.path.relpath(path, out) for path in (*pictures, evaluation.viewer, evaluation.tables)]
     update_record(
         out,
         dataset=child.dataset,

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any, NamedTuple, NotRequired
 
 from pydantic import ConfigDict, Field, TypeAdapter
 from typing_extensions import TypedDict
@@ -71,20 +71,30 @@ def unsent_rows(folder: Path, offsets: dict[str, int], *, values: int) -> Iterat
             yield path.name, offset, rows
 
 
-def unsent_artifacts(folder: Path, relatives: list[str], stamps: dict[str, str]) -> Iterator[tuple[Path, str, str]]:
-    """Files that are new or have changed: path, name in the record's folder, stamp of its signature.
+class Artifact(NamedTuple):
+    """A file to send: its ``name`` in the record's folder, the folder on the server ("" for none), and a stamp."""
+
+    path: Path
+    name: str
+    place: str
+    stamp: str
+
+
+def unsent_artifacts(folder: Path, relatives: list[str], stamps: dict[str, str]) -> Iterator[Artifact]:
+    """Files that are new or have changed. On the server each of ``relatives`` is without the folders above it.
 
     What a name or a link leads to outside the folder is left out, with a warning; so is what is no regular file.
     """
     for relative in (relative for relative in relatives if _is_own(folder, relative)):
         root = folder / relative
+        above = os.path.dirname(os.path.relpath(root, folder))
         for path in _files_below(root) if root.is_dir() else [root]:
             name = os.path.relpath(path, folder)
             if not path.name.startswith(".") and _is_own(folder, name) and path.is_file():
                 status = path.stat()
                 stamp = f"{status.st_mtime_ns} {status.st_size}"
                 if stamps.get(name) != stamp:
-                    yield path, name, stamp
+                    yield Artifact(path, name, os.path.dirname(os.path.relpath(name, above or os.curdir)), stamp)
 
 
 def _files_below(root: Path) -> Iterator[Path]:

@@ -239,9 +239,9 @@ class _Publication:
             self.client.log_batch(self.sent["run"], metrics=points[start : start + _METRICS_AT_ONCE])
 
     def _send_artifacts(self) -> None:
-        for path, name, stamp in unsent_artifacts(self.folder, self.record.artifacts, self.sent["artifacts"]):
-            self.client.log_artifact(self.sent["run"], str(path), os.path.dirname(name) or None)
-            self.sent["artifacts"][name] = stamp
+        for each in unsent_artifacts(self.folder, self.record.artifacts, self.sent["artifacts"]):
+            self.client.log_artifact(self.sent["run"], str(each.path), each.place or None)
+            self.sent["artifacts"][each.name] = each.stamp
             self._note()
 
     def _register_model(self) -> None:

@@ -1,5 +1,6 @@
 """A run's weights as a registered model of MLflow: logged with the code that runs them, once."""
 
+import json
 import os
 import shutil
 import tempfile
@@ -113,6 +114,7 @@ class Registration:
     def _register_version(self, name: str, source: str, model: str) -> str:
         """As log_model's own registration, which prints into the progress bars."""
         from mlflow.exceptions import MlflowException
+        from mlflow.utils.mlflow_tags import MLFLOW_MODEL_VERSIONS
 
         try:
             call = _how_to_call(f"models:/{name}@{ALIAS}")
@@ -120,8 +122,10 @@ class Registration:
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-        version = self.client.create_model_version(name, source, self.run, tags=self.marks, model_id=model)
-        return str(version.version)
+        made = self.client.create_model_version(name, source, self.run, tags=self.marks, model_id=model)
+        linked = json.dumps([{"name": name, "version": made.version}])  # by it the pages of runs link the version
+        self.client.set_logged_model_tags(model, {MLFLOW_MODEL_VERSIONS: linked})
+        return str(made.version)
 
 
 @contextmanager

@@ -146,6 +146,14 @@ def artifacts_of(server: Server, run: Any, folder: str | None = None) -> set[str
     return files.union(*(artifacts_of(server, run, its.path) for its in found if its.is_dir))
 
 
+def test_artifacts_lie_on_the_server_without_the_folders_above_them(root: Path, server: Server) -> None:
+    (root / "run" / "more").mkdir()
+    (root / "run" / "more" / "page.html").write_text("a page")
+    update_record(root, artifacts=["run/figures", "run/more/page.html"])
+    publish(root, server)
+    assert artifacts_of(server, runs_of(server)["quick"]) == {"figures/curve.png", "page.html"}
+
+
 def test_nothing_outside_the_folder_of_a_record_is_sent(
     root: Path, server: Server, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -458,6 +466,8 @@ def _described(run: Path, server: Server) -> None:
     (shown,) = runs_of(server)["whole"].outputs.model_outputs
     version = client.get_model_version_by_alias("dsffnet", ALIAS)
     assert version.source == f"models:/{shown.model_id}"
+    linked = client.get_logged_model(shown.model_id).tags["mlflow.modelVersions"]  # the run's page links it
+    assert json.loads(linked) == [{"name": "dsffnet", "version": version.version}]
     assert "PMD 7.5e-4" in version.description and 'load_model("models:/dsffnet/1")' in version.description
     assert f'load_model("models:/dsffnet@{ALIAS}")' in client.get_registered_model("dsffnet").description
     update_record(run, model_about="PMD 3.5e-4")
