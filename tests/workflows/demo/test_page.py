@@ -15,8 +15,10 @@ import psutil
 import pytest
 import trimesh
 
-from datagen.mesh.files import load_mesh, save_mesh
-from tests.workflows.demo.chromium import Browser, chromium
+from datagen.characters.motion import animation_names
+from datagen.mesh.files import load_mesh, read_mesh_file, save_mesh
+from datagen.mesh.sequences import write_animation
+from tests.support.chromium import Browser, chromium
 from workflows.demo.bodies import mesh_of, random_figure
 from workflows.demo.poses import PERSON
 from workflows.demo.uploads import BYTE_LIMIT
@@ -69,11 +71,10 @@ def page(server: tuple[str, psutil.Process], tmp_path: Path) -> Iterator[Browser
         yield browser
 
 
-def choose_own(page: Browser, tab: str, mesh: Path) -> None:
+def choose_own(page: Browser, tab: str, mesh: Path, *, dropped: bool = False) -> None:
     page.click(tab)
     page.choose("Body", "my own mesh")
-    page.wait(lambda: page.has_file_input)
-    page.choose_file(mesh)
+    (page.drop_file if dropped else page.choose_file)(mesh)
     page.wait_for_text(f"{mesh.name}. Another file")
 
 
@@ -93,7 +94,7 @@ def test_upload_transfer_download_refusals_and_memory(
     page: Browser, server: tuple[str, psutil.Process], meshes: list[Path], tmp_path: Path
 ) -> None:
     choose_own(page, "Source", meshes[0])
-    choose_own(page, "Target", meshes[1])
+    choose_own(page, "Target", meshes[1], dropped=True)
     page.wait(lambda: posed(page) == "615")
 
     page.click("Download OBJ")
@@ -143,7 +144,6 @@ def test_clothes_poses_of_a_file_and_geometries(page: Browser, meshes: list[Path
     np.savez(walk, poses=frames)
     page.click("Source")
     page.choose("Poses", "my own (.npz)")
-    page.wait(lambda: page.has_file_input)
     page.choose_file(walk)
     page.wait_for_text("walk, 8 poses")
     page.click("Play")
@@ -158,13 +158,27 @@ def test_clothes_poses_of_a_file_and_geometries(page: Browser, meshes: list[Path
         scene.add_geometry(solid, node_name=name, geom_name=name)
     two = tmp_path / "two.glb"
     two.write_bytes(scene.export(file_type="glb"))
-    page.click("Target")
-    page.choose("Body", "my own mesh")
-    page.wait(lambda: page.has_file_input)
-    page.choose_file(two)
+    choose_own(page, "Target", two)
     page.wait_for_text("Not posed. two.glb holds 2 geometries")
     page.click("person")
     page.wait(lambda: posed(page) == "615")
+
+
+def test_an_animated_glb_is_played_and_comes_back_as_an_animation(
+    page: Browser, meshes: list[Path], tmp_path: Path
+) -> None:
+    walk = tmp_path / "walk.glb"
+    still, moved = (load_mesh(path).vertices for path in meshes)
+    write_animation(read_mesh_file(meshes[0]), [still, (still + moved) / 2, still], walk, frames_per_second=15)
+    choose_own(page, "Target", meshes[1])
+    choose_own(page, "Source", walk)
+    page.wait_for_text("3 of 3 frames, 615 vertices")
+    page.click("Download GLB")
+    result = page.downloads / "person-posed.glb"
+    page.wait(result.exists)
+    assert animation_names(result) == ("poses",)
+    page.choose("Animation", "none: at rest")
+    page.wait(lambda: "frames" not in page.text())
 
 
 def test_two_people_do_not_see_each_others_meshes(

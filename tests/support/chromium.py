@@ -22,13 +22,17 @@ _FLAGS = (
 _LONG = 240  # seconds, on a machine that has other work
 _FILE_INPUT = "[...document.querySelectorAll('input[type=file]')].find(e => e.getClientRects().length)"
 
+_MIDDLE = """(() => { e.scrollIntoView({block: 'center'});
+    const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] })()"""
+"""Of an element e, which is brought into view."""
+
 
 class Browser:
     """One tab."""
 
     def __init__(self, socket: Any, downloads: Path) -> None:
         self._socket, self._numbers = socket, itertools.count(1)
-        self.downloads, self.requests = downloads, list[str]()
+        self.downloads, self.requests, self.clicks = downloads, list[str](), 0
         for domain in ("Page", "Runtime", "DOM", "Network"):
             self.call(f"{domain}.enable")
         self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
@@ -73,13 +77,12 @@ class Browser:
         """Wait until the page says so."""
         self.wait(lambda: words in self.text())
 
-    def click(self, words: str) -> None:
-        """Click the innermost visible element of exactly these words."""
+    def click(self, words: str, *, among: str = "button, label, [role=tab], [role=option]") -> None:
+        """Click the innermost visible element of exactly these words, of those that a CSS selector names."""
         place = self.run(
-            f"""(() => {{ const found = [...document.querySelectorAll('button, label, [role=tab], [role=option]')]
+            f"""(() => {{ const found = [...document.querySelectorAll({json.dumps(among)})]
             .filter(e => e.innerText.trim() === {json.dumps(words)} && e.getClientRects().length);
-            if (!found.length) return null; const e = found[found.length - 1]; e.scrollIntoView({{block: 'center'}});
-            const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"""
+            const e = found[found.length - 1]; return e ? {_MIDDLE} : null }})()"""
         )
         assert place, f"nothing to click is called {words!r}: {self.text()}"
         self.click_at(*place)
@@ -99,8 +102,7 @@ class Browser:
                 f"""(() => {{ let e = [...document.querySelectorAll('label')]
                 .filter(e => e.innerText.trim() === {json.dumps(label)} && e.getClientRects().length).pop();
                 while (e && !e.querySelector('input')) e = e.parentElement;
-                if (!e) return null; e = e.querySelector('input'); e.scrollIntoView({{block: 'center'}});
-                const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"""
+                if (!e) return null; e = e.querySelector('input'); return {_MIDDLE} }})()"""
             )
             if not place:
                 return False
@@ -113,24 +115,25 @@ class Browser:
         self.wait(opened)
         self.click(option)
 
-    @property
-    def has_file_input(self) -> bool:
-        """Whether a file can be chosen."""
-        return bool(self.run(f"!!{_FILE_INPUT}"))
-
     def click_at(self, x: float, y: float) -> None:
         """Press and release the left button there."""
+        self.clicks += 1
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def choose_file(self, path: Path) -> None:
-        """Give a file to the page's visible file input."""
+        """Give a file to the page's file input, as soon as one is visible."""
+        self.wait(lambda: self.run(f"!!{_FILE_INPUT}"))
         self.call("DOM.getDocument")
-        found = self.call(
-            "Runtime.evaluate",
-            expression=_FILE_INPUT,
-        )
+        found = self.call("Runtime.evaluate", expression=_FILE_INPUT)
         self.call("DOM.setFileInputFiles", files=[str(path)], objectId=found["result"]["objectId"])
+
+    def drop_file(self, path: Path) -> None:
+        """Drag a file onto the page's file input and let it go there, as soon as one is visible."""
+        place = self.wait(lambda: self.run(f"(() => {{ const e = {_FILE_INPUT}; return e && {_MIDDLE} }})()"))
+        data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self.call("Input.dispatchDragEvent", type=kind, x=place[0], y=place[1], data=data)
 
     def picture(self, path: Path) -> None:
         """Write what is seen as a PNG."""
@@ -150,7 +153,7 @@ def chromium(folder: Path) -> Iterator[Browser]:
     command = [program, *_FLAGS, f"--user-data-dir={profile}", "about:blank"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            with connect(_tab(profile), max_size=None) as socket:
+            with connect(_tab(profile), max_size=None, ping_interval=None) as socket:
                 yield Browser(socket, downloads)
         finally:
             process.terminate()
