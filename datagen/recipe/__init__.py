@@ -13,7 +13,7 @@ from datagen.recipe.bodies import (
     SmalBody,
     SmplBody,
 )
-from datagen.recipe.clothed import OUTFITS, ClothedBody, DrapeSolver, GarmentFile, GarmentPart, OwnOutfit
+from datagen.recipe.clothed import OUTFITS, PART_KINDS, ClothedBody, DrapeSolver, GarmentFile, GarmentPart, OwnOutfit
 from datagen.recipe.dataset import (
     ANIMALS,
     PATH_KEYS,
@@ -29,6 +29,7 @@ from datagen.recipe.poses import AmassPoses, ClipPoses, Distribution, FilePoses,
 __all__ = [
     "ANIMALS",
     "OUTFITS",
+    "PART_KINDS",
     "PATH_KEYS",
     "AmassPoses",
     "AnnyBody",

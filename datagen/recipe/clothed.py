@@ -57,7 +57,7 @@ class Wearer(Frozen):
 class GarmentFile(Frozen):
     """One part of an outfit from a mesh file, made for a person of Anny in the T-pose: metres, Y up, facing +Z."""
 
-    group: Literal["file"] = Field(description="file: a mesh file of one's own")
+    group: Literal["file"] = Field("file", description="file: a mesh file of one's own")
     path: str = Field("", description="the file: OBJ, PLY or GLB. Not part of the dataset's identity: its hash is")
     geometry: str = Field("", description="which geometry of a GLB, or group of an OBJ; default: the whole file")
     unit: float = Field(1.0, gt=0, description="metres in one unit of the file: 0.01 for centimetres")
@@ -72,12 +72,18 @@ class GarmentFile(Frozen):
     stiffness: Literal["soft", "normal", "stiff"] = Field("normal", description="how much the cloth resists bending")
 
 
+PART_KINDS = ("tights", "file")
+"""What the two kinds of parts are called where a fault lies: each after the default of its group."""
+
+
 def _kind(part: Any) -> str:
     group = part.get("group") if isinstance(part, Mapping) else getattr(part, "group", None)
-    return "file" if group == "file" else "cut"
+    return PART_KINDS[group == "file"]
 
 
-Part = Annotated[Annotated[GarmentPart, Tag("cut")] | Annotated[GarmentFile, Tag("file")], Discriminator(_kind)]
+Part = Annotated[
+    Annotated[GarmentPart, Tag(PART_KINDS[0])] | Annotated[GarmentFile, Tag(PART_KINDS[1])], Discriminator(_kind)
+]
 
 _TROUSERS, _SHIRT = GarmentPart(low=0.2, high=2.9), GarmentPart(low=1.9, sleeve=1.85, pins=("top", "sleeves"))
 _TUCKED = _SHIRT.model_copy(update={"low": 2.7, "pins": ("top", "sleeves", "hem")})

@@ -11,7 +11,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from datagen.common.errors import RecipeError
-from datagen.recipe import ANIMALS, DatasetRecipe, Frozen
+from datagen.recipe import ANIMALS, PART_KINDS, DatasetRecipe, Frozen
 from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
 from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
 from training.recipes.networks import AvatarRecipe, TemplateRecipe
@@ -282,8 +282,8 @@ def _describe(fault: Any, listed: set[str] | None) -> str:
     """One fault in words; of an unknown key with the keys of its section, unless these are ``listed`` (None: never)."""
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
-    parts = zip(["", *location], location, strict=False)
-    key = ".".join(part for before, part in parts if not (before in _UNIONS and part in _MEMBERS))
+    parts = zip(["", "", *location], ["", *location], location, strict=False)
+    key = ".".join(part for *before, part in parts if not (_is_one_of_several(*before) and part in _MEMBERS))
     if fault["type"] == "extra_forbidden":
         known = [line.split()[0] for line in describe_fields()]
         if key.startswith("beside."):
@@ -296,6 +296,11 @@ def _describe(fault: Any, listed: set[str] | None) -> str:
             keys = _its_keys(location, section)
         return f"unknown key {shown(key)}{nearest(key, known)}{keys}"
     return fault_text(fault, key=key)
+
+
+def _is_one_of_several(section: str, place: str) -> bool:
+    """Whether what stands at a place of a section, a key or a number in a list, may be of several kinds."""
+    return place in _UNIONS or (section in ("bodies", "parts") and place.isdigit())
 
 
 def _its_keys(location: list[str], section: str) -> str:
@@ -332,4 +337,4 @@ def _members(section: str, key: str) -> Iterator[str]:
     yield from (kind.model_fields[key].default for kind in _parts(model.model_fields[last].annotation))
 
 
-_MEMBERS = {member for section, key, _ in _KINDS for member in _members(section, key)}
+_MEMBERS = {*PART_KINDS, *(member for section, key, _ in _KINDS for member in _members(section, key))}

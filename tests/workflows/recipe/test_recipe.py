@@ -75,6 +75,14 @@ def test_saved_and_read_again_it_is_the_same(tmp_path: Path) -> None:
             ["trainig.steps=5"],
             r"unknown key 'trainig', did you mean 'training.*\(a recipe has description, data, train",
         ),
+        (
+            ["data.body={family: mixed, bodies: [{family: anny, topolgy: x}]}"],
+            r"unknown key 'data.body.bodies.0.topolgy'",
+        ),
+        (
+            ["data.body={family: clothed, own: [{name: x, parts: [{group: file, pth: a.obj}]}]}"],
+            r"unknown key 'data.body.own.0.parts.0.pth', .* \(.* has group, path, geometry, unit, follows, fits, ",
+        ),
         (["data.poses.sen=5"], r"unknown key 'data.poses.sen', .* \(data.poses has seen, unseen, distribution, seed\)"),
         (["training.network.name=npt", "training.network.witdh=5"], r"\(training.network has name, variant.*\)\. All"),
         (["training.batch=many"], r"training.batch: .*integer.*\(given: 'many'\)"),
