@@ -57,8 +57,8 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
             truth = outer_scan(subject, frame)
             made = {"the target as it is": Mesh(target.vertices, truth.faces)}
             for name, transfer in transfers.items():
-                given = {"source": posed[place], "target": target, "source_axes": UPRIGHT, "target_axes": UPRIGHT}
-                made[name] = Mesh(transfer(**given).vertices, truth.faces)
+                output = transfer(source=posed[place], target=target, source_axes=UPRIGHT, target_axes=UPRIGHT)
+                made[name] = Mesh(output.vertices, truth.faces)
             made["template + skinning by the pose read"] = Mesh(by_read[place].skinned, faces)
             made["avatar by the pose read"] = by_read[place].mesh
             made["avatar by the true pose"] = by_truth[place].mesh

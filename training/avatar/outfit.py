@@ -8,9 +8,11 @@ template.safetensors  the canonical surface that was learned
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -25,10 +27,32 @@ from training.avatar.subject import Subject
 from training.avatar.template import Template
 from training.checkpoints.weights import read_header, read_weights, write_weights_atomically
 
+Kept = TypeVar("Kept")
+
+
+@dataclass(frozen=True)
+class Stored(Generic[Kept]):
+    """A file of an outfit's folder, and what reads it."""
+
+    path: Path
+    read: Callable[[Path], Kept]
+
+    def load(self) -> Kept:
+        """What lies in it (CheckpointError where it is missing, damaged, or something else)."""
+        return self.read(self.path)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether it is there and whole."""
+        try:
+            return bool(read_header(self.path))
+        except (CheckpointError, UnsafeFileError):
+            return False
+
 
 @dataclass(frozen=True)
 class Outfit:
-    """Paths within the folder of an outfit, and what lies there."""
+    """The folder of an outfit."""
 
     path: Path
 
@@ -38,52 +62,32 @@ class Outfit:
         return self.path.name
 
     @property
-    def samples(self) -> Path:
-        """See :class:`OccupancySamples`."""
-        return self.path / "samples.safetensors"
-
-    @property
-    def surfaces(self) -> Path:
-        """See :class:`SurfaceSamples`."""
-        return self.path / "surfaces.safetensors"
-
-    @property
-    def template_file(self) -> Path:
-        """See :class:`training.avatar.template.Template`."""
-        return self.path / "template.safetensors"
-
-    @property
-    def field_file(self) -> Path:
-        """See :class:`training.avatar.diffusion.SkinningField`."""
-        return self.path / "field.safetensors"
-
-    @property
-    def subject_file(self) -> Path:
-        """See :class:`training.avatar.subject.Subject`."""
-        return self.path / "subject.safetensors"
-
-    def subject(self) -> Subject:
+    def subject(self) -> Stored[Subject]:
         """The body and its scans."""
-        return Subject.load(self.subject_file)
+        return Stored(self.path / "subject.safetensors", Subject.load)
 
-    def field(self) -> SkinningField:
+    @property
+    def field(self) -> Stored[SkinningField]:
         """The field around the body."""
-        return SkinningField.load(self.field_file)
+        return Stored(self.path / "field.safetensors", SkinningField.load)
 
-    def occupancy_samples(self) -> "OccupancySamples":
+    @property
+    def samples(self) -> "Stored[OccupancySamples]":
         """Points around the scans."""
-        return OccupancySamples.load(self.samples)
+        return Stored(self.path / "samples.safetensors", OccupancySamples.load)
 
-    def surface_samples(self) -> "SurfaceSamples":
+    @property
+    def surfaces(self) -> "Stored[SurfaceSamples]":
         """Points of the scans."""
-        return SurfaceSamples.load(self.surfaces)
+        return Stored(self.path / "surfaces.safetensors", SurfaceSamples.load)
 
-    def template(self) -> Template:
+    @property
+    def template(self) -> Stored[Template]:
         """The canonical surface."""
-        return Template.load(self.template_file)
+        return Stored(self.path / "template.safetensors", Template.load)
 
     @staticmethod
-    def fingerprint(*files: Path) -> str:
+    def fingerprint(*files: Stored[Any]) -> str:
         """What tells files from others: a hash over the hashes of their bytes.
 
         Raises
@@ -92,9 +96,9 @@ class Outfit:
             One is missing.
         """
         for file in files:
-            if not file.is_file():
-                raise CheckpointError(f"{file} is missing. Make it: dsffnet avatar train with the same --out")
-        return hashlib.sha256("".join(map(sha256_of, files)).encode()).hexdigest()
+            if not file.path.is_file():
+                raise CheckpointError(f"{file.path} is missing. Make it: dsffnet avatar train with the same --out")
+        return hashlib.sha256("".join(sha256_of(file.path) for file in files).encode()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,15 +184,7 @@ def outfits_in(folder: Path) -> list[Outfit]:
     CheckpointError
         There is none.
     """
-    found = [Outfit(path) for path in sorted(folder.glob("*/")) if (path / "subject.safetensors").is_file()]
+    found = [Outfit(path) for path in sorted(folder.glob("*/")) if Outfit(path).subject.path.is_file()]
     if not found:
         raise CheckpointError(f"{folder} holds no outfits. Make them: dsffnet avatar train --out {folder.parent}")
     return found
-
-
-def is_sound(path: Path) -> bool:
-    """Whether a file of an outfit is there and whole."""
-    try:
-        return bool(read_header(path))
-    except (CheckpointError, UnsafeFileError):
-        return False

@@ -59,7 +59,7 @@ class Wardrobe:
         CheckpointError
             A file is missing or damaged.
         """
-        return cls(tuple(its.subject() for its in outfits), tuple(its.template() for its in outfits), recipe)
+        return cls(tuple(its.subject.load() for its in outfits), tuple(its.template.load() for its in outfits), recipe)
 
     @cached_property
     def views(self) -> Views:

@@ -21,7 +21,7 @@ from datagen.store import Dataset
 from training.avatar.body import canonical_body
 from training.avatar.diffusion import SkinningField, diffused_skinning
 from training.avatar.occupancy import HIDDEN_DEPTH, FrameSamples, frame_samples, hand_samples, surface_points
-from training.avatar.outfit import OccupancySamples, Outfit, SurfaceSamples, is_sound
+from training.avatar.outfit import OccupancySamples, Outfit, SurfaceSamples
 from training.avatar.solid import Solid
 from training.avatar.subject import Subject, posed_by
 from training.avatar.template import pose_condition
@@ -30,7 +30,7 @@ from workflows.avatar.recipe import AvatarWorkflow, FieldRecipe, ScanRecipe
 from workflows.pipeline.progress import bar
 from workflows.pipeline.tasks import TaskRunner
 
-MADE = ("subject_file", "field_file", "samples", "surfaces")
+MADE = ("subject", "field", "samples", "surfaces")
 """What is made of an outfit before its template is learned, by the names of :class:`training.avatar.outfit.Outfit`."""
 _HAND_POINTS = 5_000
 
@@ -41,18 +41,18 @@ def make_outfits(recipe: AvatarWorkflow, dataset: Dataset, folder: Path, tasks: 
         outfit = Outfit(folder / subject.name)
         if not is_of(outfit, dataset.uuid):
             for name in MADE:
-                getattr(outfit, name).unlink(missing_ok=True)
-            subject.save(outfit.subject_file)
-        if not is_sound(outfit.field_file):
-            _field(recipe.field, subject).save(outfit.field_file)
-        if not (is_sound(outfit.samples) and is_sound(outfit.surfaces)):
+                getattr(outfit, name).path.unlink(missing_ok=True)
+            subject.save(outfit.subject.path)
+        if not outfit.field.is_sound:
+            _field(recipe.field, subject).save(outfit.field.path)
+        if not (outfit.samples.is_sound and outfit.surfaces.is_sound):
             _draw(recipe.scans, outfit, subject, tasks)
 
 
 def is_of(outfit: Outfit, source: str) -> bool:
     """Whether an outfit's scans are there, whole, and those of a dataset."""
     try:
-        return bool(read_header(outfit.subject_file).get("source") == source)
+        return bool(read_header(outfit.subject.path).get("source") == source)
     except (CheckpointError, UnsafeFileError):
         return False
 
@@ -133,7 +133,9 @@ def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunne
     )
     around, points, normals = zip(*found, strict=True)
     least = min(len(its) for its in points)
-    SurfaceSamples(*(torch.stack([its[:least] for its in each]) for each in (points, normals))).save(outfit.surfaces)
+    SurfaceSamples(*(torch.stack([its[:least] for its in each]) for each in (points, normals))).save(
+        outfit.surfaces.path
+    )
     samples = FrameSamples(*(torch.stack(each) for each in zip(*around, strict=True)))
     hands, inside = hand_samples(generator(0, Stream.AUGMENTATION), subject.body, _HAND_POINTS)
     OccupancySamples(
@@ -142,16 +144,18 @@ def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunne
         is_seen=torch.from_numpy(subject.is_seen),
         hand_points=hands,
         hand_inside=inside,
-    ).save(outfit.samples)
+    ).save(outfit.samples.path)
 
 
 def draw_frame(place: str, frame: int, around: int, surface: int) -> tuple[FrameSamples, torch.Tensor, torch.Tensor]:
     """Points around a scan, and points and normals of its outer surface; a function of the outfit and the frame."""
     outfit = Outfit(Path(place))
-    subject, random = outfit.subject(), generator(0, Stream.AUGMENTATION, frame + 1)
+    subject, random = outfit.subject.load(), generator(0, Stream.AUGMENTATION, frame + 1)
     scan = solid_parts(subject, frame)
     transforms = subject.transforms[frame].astype(np.float64)
-    samples = frame_samples(random, scan, body=subject.body, field=outfit.field(), transforms=transforms, count=around)
+    samples = frame_samples(
+        random, scan, body=subject.body, field=outfit.field.load(), transforms=transforms, count=around
+    )
     points, normals = surface_points(random, scan, surface)
     return samples, torch.from_numpy(points).float(), torch.from_numpy(normals).float()
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from datagen.common.errors import CheckpointError, RecipeError
 from datagen.store import open_dataset
-from training.avatar.outfit import is_sound, outfits_in
+from training.avatar.outfit import outfits_in
 from training.avatar.template import extract_template, plainest_pose
 from training.tracking.record import has_record, update_record
 from workflows.avatar.evaluate import evaluate_avatar
@@ -39,7 +39,7 @@ def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
             Stage(
                 "templates",
                 depends_on=of_templates,
-                intact=lambda: _are_sound(recipe, folder, "template_file"),
+                intact=lambda: _are_sound(recipe, folder, "template"),
                 work=lambda: _learn_templates(recipe, folder, tasks),
             ),
             Stage(
@@ -94,7 +94,7 @@ def _are_sound(recipe: AvatarWorkflow, folder: AvatarFolder, *files: str) -> boo
     except CheckpointError:
         return False
     source = open_dataset(folder.data).uuid
-    whole = all(is_of(its, source) and is_sound(getattr(its, file)) for its in outfits for file in files)
+    whole = all(is_of(its, source) and getattr(its, file).is_sound for its in outfits for file in files)
     return whole and len(outfits) == recipe.data.identities.evaluation
 
 
@@ -103,11 +103,11 @@ def _learn_templates(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRu
         run = folder.template(outfit.name)
         learn(recipe.template, outfit.path, run, parent=folder.path, tasks=tasks, name=f"template {outfit.name}")
         network = trained(recipe.template, outfit.path, run, section="template")
-        samples = outfit.occupancy_samples()
+        samples = outfit.samples.load()
         template = extract_template(
-            network, plainest_pose(samples.conditions[samples.seen]), outfit.field(), cell=recipe.cell
+            network, plainest_pose(samples.conditions[samples.seen]), outfit.field.load(), cell=recipe.cell
         )
-        template.save(outfit.template_file)
+        template.save(outfit.template.path)
         say(
             f"template of {outfit.name}: {len(template.vertices):,} points, Euler characteristic "
             f"{template.euler_characteristic}"

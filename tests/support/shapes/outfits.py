@@ -36,9 +36,9 @@ def stockinged() -> Subject:
 def drawn_outfit(folder: Path, *, with_template: bool = True) -> Outfit:
     """Its folder; the template is the bare leg."""
     subject, outfit = stockinged(), Outfit(folder / "stocking")
-    subject.save(outfit.subject_file)
+    subject.save(outfit.subject.path)
     field = diffused_skinning(subject.body, centres=80, spacing=0.08)
-    field.save(outfit.field_file)
+    field.save(outfit.field.path)
     around, surfaces = list[FrameSamples](), list[tuple[torch.Tensor, torch.Tensor]]()
     for frame in range(len(subject.scans)):
         random, scan = np.random.default_rng(frame), [subject.scan(frame)]
@@ -47,16 +47,16 @@ def drawn_outfit(folder: Path, *, with_template: bool = True) -> Outfit:
         around.append(frame_samples(random, scan, count=400, **given))
         points, normals = surface_points(random, scan, 800)
         surfaces.append((torch.from_numpy(points).float(), torch.from_numpy(normals).float()))
-    SurfaceSamples(*(torch.stack(its) for its in zip(*surfaces, strict=True))).save(outfit.surfaces)
+    SurfaceSamples(*(torch.stack(its) for its in zip(*surfaces, strict=True))).save(outfit.surfaces.path)
     OccupancySamples(
         *(torch.stack(its) for its in zip(*around, strict=True)),
         conditions=pose_condition(subject.rotations.astype(np.float64)),
         is_seen=torch.from_numpy(subject.is_seen),
         hand_points=torch.empty(0, 3),
         hand_inside=torch.empty(0, dtype=torch.bool),
-    ).save(outfit.samples)
+    ).save(outfit.samples.path)
     if with_template:
-        bare_template(Mesh(subject.body.vertices, subject.body.faces), subject.body.weights).save(outfit.template_file)
+        bare_template(Mesh(subject.body.vertices, subject.body.faces), subject.body.weights).save(outfit.template.path)
     return outfit
 
 

@@ -8,7 +8,7 @@ import torch
 
 from datagen.common.errors import CheckpointError
 from tests.support.shapes.outfits import drawn_outfit, stockinged
-from training.avatar.outfit import OccupancySamples, Outfit, SurfaceSamples, is_sound, outfits_in
+from training.avatar.outfit import OccupancySamples, Outfit, SurfaceSamples, outfits_in
 from training.avatar.subject import Subject, posed_by
 
 
@@ -36,19 +36,19 @@ def test_transforms_are_those_of_the_poses() -> None:
 def test_the_folder_of_an_outfit(tmp_path: Path) -> None:
     outfit = drawn_outfit(tmp_path)
     assert [its.name for its in outfits_in(tmp_path)] == ["stocking"]
-    samples, surfaces = outfit.occupancy_samples(), outfit.surface_samples()
+    samples, surfaces = outfit.samples.load(), outfit.surfaces.load()
     assert samples.count == 450 and samples.seen == [0, 1, 2] and samples.unseen == [3]
     assert samples.frame(1, np.array([4, 2])).roots.shape == (2, 3, 3)
     assert surfaces.points.shape == surfaces.normals.shape == (4, 800, 3)
     assert torch.allclose(surfaces.normals.norm(dim=2), torch.ones(()), atol=1e-4)
     before = Outfit.fingerprint(outfit.samples, outfit.surfaces)
-    SurfaceSamples(surfaces.points + 1, surfaces.normals).save(outfit.surfaces)
+    SurfaceSamples(surfaces.points + 1, surfaces.normals).save(outfit.surfaces.path)
     assert Outfit.fingerprint(outfit.samples, outfit.surfaces) != before
     many = [outfit.samples] * 70
     assert Outfit.fingerprint(*many) != Outfit.fingerprint(*many[:-1], outfit.surfaces), "however many files there are"
-    assert is_sound(outfit.field_file) and not is_sound(tmp_path / "nothing")
-    outfit.field_file.write_bytes(outfit.field_file.read_bytes()[:100])
-    assert not is_sound(outfit.field_file)
+    assert outfit.field.is_sound and not Outfit(tmp_path / "nothing").field.is_sound
+    outfit.field.path.write_bytes(outfit.field.path.read_bytes()[:100])
+    assert not outfit.field.is_sound
 
 
 def test_what_is_not_there_or_something_else_is_one_line(tmp_path: Path) -> None:
@@ -56,12 +56,12 @@ def test_what_is_not_there_or_something_else_is_one_line(tmp_path: Path) -> None
     with pytest.raises(CheckpointError, match=r"holds no outfits. Make them: dsffnet avatar train"):
         outfits_in(tmp_path / "elsewhere")
     with pytest.raises(CheckpointError, match="no scans of a person"):
-        Subject.load(outfit.field_file)
+        Subject.load(outfit.field.path)
     with pytest.raises(CheckpointError, match="not roots, valid, inside"):
-        OccupancySamples.load(outfit.surfaces)
-    outfit.samples.unlink()
+        OccupancySamples.load(outfit.surfaces.path)
+    outfit.samples.path.unlink()
     with pytest.raises(CheckpointError, match=r"samples.safetensors is missing. Make it: dsffnet avatar train"):
         Outfit.fingerprint(outfit.samples)
-    outfit.surfaces.write_bytes(outfit.surfaces.read_bytes()[:-7])
+    outfit.surfaces.path.write_bytes(outfit.surfaces.path.read_bytes()[:-7])
     with pytest.raises(CheckpointError, match="cannot be read as weights"):
-        outfit.surface_samples()
+        outfit.surfaces.load()

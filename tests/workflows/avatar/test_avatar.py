@@ -145,7 +145,7 @@ def test_hidden_triangles_of_a_scan_do_not_count() -> None:
 def test_scans_of_another_dataset_are_made_again(tmp_path: Path) -> None:
     outfit = drawn_outfit(tmp_path)
     assert is_of(outfit, "a leg") and not is_of(outfit, "another dataset")
-    outfit.subject_file.write_bytes(b"")
+    outfit.subject.path.write_bytes(b"")
     assert not is_of(outfit, "a leg")
 
 

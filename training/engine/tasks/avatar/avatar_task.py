@@ -63,7 +63,7 @@ class AvatarTask:
         assert isinstance(recipe.network, AvatarRecipe)
         self._recipe, self._network, self._outfits = recipe, recipe.network, outfits
         self.url = url
-        files = [file for its in outfits for file in (its.subject_file, its.template_file, its.surfaces)]
+        files = [file for its in outfits for file in (its.subject, its.template, its.surfaces)]
         self.uuid = self.sha256 = Outfit.fingerprint(*files)
         self._wardrobe = Wardrobe.of(outfits, self._network)
 
@@ -116,7 +116,7 @@ class FrameFeed:
     ) -> None:
         assert isinstance(recipe.network, AvatarRecipe)
         self._seed, self._count, self._wardrobe, self._order = recipe.seed, recipe.network.scan_points, wardrobe, order
-        self._surfaces = [its.surface_samples() for its in outfits]
+        self._surfaces = [its.surfaces.load() for its in outfits]
         self._mine, self._device = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}, device
 
     def batches(self, first_step: int) -> Shares:
@@ -144,7 +144,7 @@ class AvatarValidation:
 
     def __init__(self, wardrobe: Wardrobe, outfits: Sequence[Outfit], device: torch.device, dtype: torch.dtype) -> None:
         self._wardrobe, self._dtype = wardrobe.to(device), dtype
-        self._surfaces = [its.surface_samples() for its in outfits]
+        self._surfaces = [its.surfaces.load() for its in outfits]
 
     def measure(self, network: nn.Module) -> dict[str, float]:
         """See the class."""

@@ -63,7 +63,7 @@ class TemplateTask:
         assert isinstance(recipe.network, TemplateRecipe)
         self._recipe, self._network, self._outfit = recipe, recipe.network, outfit
         self.url = str(outfit.path)
-        self.uuid = self.sha256 = outfit.fingerprint(outfit.samples, outfit.field_file)
+        self.uuid = self.sha256 = outfit.fingerprint(outfit.samples, outfit.field)
 
     @property
     def order(self) -> FrameOrder:
@@ -72,7 +72,7 @@ class TemplateTask:
 
     @cached_property
     def _samples(self) -> OccupancySamples:
-        return OccupancySamples.load(self._outfit.samples)
+        return self._outfit.samples.load()
 
     def check(self, room: Room, ranks: int) -> None:
         """The order says whether there are frames enough; the network is small."""
@@ -181,7 +181,7 @@ class OccupancyValidation:
 
 def template_network(recipe: TemplateRecipe, outfit: Outfit) -> OccupancyTemplate:
     """A new occupancy network in the box of an outfit's field."""
-    field, samples = outfit.field(), OccupancySamples.load(outfit.samples)
+    field, samples = outfit.field.load(), outfit.samples.load()
     radius = float((field.high - field.low).max() / 2)
     centre = ((field.high + field.low) / 2).tolist()
     return OccupancyTemplate(centre=centre, radius=radius, condition=samples.conditions.shape[1], width=recipe.width)

@@ -57,9 +57,9 @@ def test_a_template_is_learned_and_extracted(outfit: Outfit, tmp_path: Path) -> 
     assert rows[-1]["evaluation/iou_unseen"] > 0.4 and rows[-1]["loss/total"] < 0.7 * rows[0]["loss/total"]
     network = task_of(recipe, str(outfit.path)).network()
     fill_network(network, require_checkpoint(tmp_path).weights(), where="")
-    samples = outfit.occupancy_samples()
-    template = extract_template(network, plainest_pose(samples.conditions), outfit.field(), cell=0.04)
-    subject = outfit.subject()
+    samples = outfit.samples.load()
+    template = extract_template(network, plainest_pose(samples.conditions), outfit.field.load(), cell=0.04)
+    subject = outfit.subject.load()
     away = torch.cdist(template.vertices, torch.from_numpy(subject.body.vertices).float()).min(dim=1).values
     assert away.mean() < 0.06 and torch.allclose(template.weights.sum(dim=1), torch.ones(()), atol=1e-3)
 
@@ -98,10 +98,10 @@ def test_a_stopped_training_goes_on_to_the_same_weights(
 def test_an_avatar_is_resumed_on_no_other_templates(outfit: Outfit, tmp_path: Path) -> None:
     other = drawn_outfit(tmp_path / "outfits")
     train(recipe_of(AVATAR, steps=1), data=str(outfit.path.parent), run=tmp_path / "run")
-    template = other.template()
-    other.template_file.unlink()
+    template = other.template.load()
+    other.template.path.unlink()
     type(template)(template.vertices + 0.1, template.faces, template.normals, template.weights).save(
-        other.template_file
+        other.template.path
     )
     recipe, place = recipe_of(AVATAR, steps=1), other.path.parent
     with pytest.raises(CheckpointError, match="was trained on dataset"):
