@@ -35,6 +35,9 @@ from workflows.pretrained import own_weights
 
 _DIRECT = {"DSFFNet": "anny-quickstart", "parts": "human"}
 _SAMPLES, _SOURCE = 20_000, 11
+_SKINNED, _READ, _TRUE = "template + skinning by the pose read", "avatar by the pose read", "avatar by the true pose"
+_DRAWN = {"source": "source", "truth": "truth", "the target as it is": "target", **{name: name for name in _DIRECT},
+          _READ: "avatar, pose read", _TRUE: "avatar, true pose"}  # fmt: skip
 
 
 def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[str, Mesh]]]:
@@ -59,9 +62,9 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
             for name, transfer in transfers.items():
                 output = transfer(source=posed[place], target=target, source_axes=UPRIGHT, target_axes=UPRIGHT)
                 made[name] = Mesh(output.vertices, truth.faces)
-            made["template + skinning by the pose read"] = Mesh(by_read[place].skinned, faces)
-            made["avatar by the pose read"] = by_read[place].mesh
-            made["avatar by the true pose"] = by_truth[place].mesh
+            made[_SKINNED] = Mesh(by_read[place].skinned, faces)
+            made[_READ] = by_read[place].mesh
+            made[_TRUE] = by_truth[place].mesh
             yield subject.name, frame, {"source": posed[place], "truth": truth} | made
 
 
@@ -115,13 +118,19 @@ def report(found: list[tuple[str, int, dict[str, Mesh]]]) -> None:
 
 def picture(found: list[tuple[str, int, dict[str, Mesh]]], path: Path) -> None:
     """Two poses of each outfit by all methods."""
-    rows, columns = list[Row](), list(found[0][2])
+    rows = list[Row]()
     for outfit in dict.fromkeys(outfit for outfit, *_ in found):
         for _, frame, meshes in [row for row in found if row[0] == outfit][:2]:
-            panels = [Panel(Mesh(standing(each.vertices), each.faces), to_rgb("#C9B458")) for each in meshes.values()]
+            shown = [meshes[name] for name in _DRAWN]
+            panels = [Panel(Mesh(standing(each.vertices), each.faces), to_rgb("#C9B458")) for each in shown]
             rows.append(Row(f"{outfit},\npose {frame}", panels))
     mesh_grid(
-        rows, path, columns=columns, title="A source's pose on people in clothes", one_scale=False, size=(230, 270)
+        rows,
+        path,
+        columns=[*_DRAWN.values()],
+        title="A source's pose on people in clothes",
+        one_scale=False,
+        size=(230, 270),
     )
 
 

@@ -3,6 +3,7 @@
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,12 @@ from datagen.common.errors import MeshError, RecipeError
 from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.poses.pose_files import write_pose_file
-from datagen.recipe import AnnyBody, PoseRecipe
+from datagen.recipe import AnnyBody, ClothedBody, PoseRecipe
 from tests.support.commands import command
 from tests.support.shapes.outfits import drawn_outfit, stockinged
 from workflows.avatar.animate import poses_of
 from workflows.avatar.evaluate import Measured, markdown
-from workflows.avatar.outfits import is_of, outer_scan
+from workflows.avatar.outfits import is_draped, is_of, outer_scan, wearers
 from workflows.avatar.recipe import known_avatars, load_avatar
 from workflows.avatar.run import run_avatar
 from workflows.pipeline.run_folder import AvatarFolder
@@ -140,6 +141,17 @@ def test_hidden_triangles_of_a_scan_do_not_count() -> None:
     )
     found = outer_scan(subject, 0)
     assert len(found.faces) == 320 and found.faces.max() < 162, "the garment within the body is hidden"
+
+
+def test_people_are_called_by_their_outfits_and_numbered_where_two_wear_one() -> None:
+    dataset: Any = SimpleNamespace(
+        recipe=SimpleNamespace(body=ClothedBody(outfits=("skirt", "coat"))),
+        identities=lambda split: [4, 5, 6, 8] if split == "evaluation" else [0],
+        parameters=lambda identity: np.array([0.5, identity % 2, 1.0]),
+    )
+    assert wearers(dataset) == {"skirt": 4, "coat": 5, "skirt-2": 6, "skirt-3": 8} and is_draped(dataset)
+    dataset.recipe.body = ClothedBody(method="skinned")
+    assert not is_draped(dataset)
 
 
 def test_scans_of_another_dataset_are_made_again(tmp_path: Path) -> None:
