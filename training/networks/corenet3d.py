@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from training.networks.layers.elain import SLOPE, Generator, Identity, iterated_once
-from training.networks.layers.input_checks import check_norm_weights, check_pair
+from training.networks.layers.input_checks import check_norm_weights, check_pair, check_widths
 from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, vertex_mean, with_zero_gradients
 from training.networks.layers.optimal_transport import transport_matrix, warp
 from training.networks.layers.sampling import masses_by
@@ -105,9 +105,7 @@ class CoreNet3D(nn.Module):
         norm_weights: Literal["uniform", "area"] = "uniform",
     ) -> None:
         super().__init__()
-        for name, widths in (("feature_widths", feature_widths), ("generator_widths", generator_widths)):
-            if len(widths) != 3 or min(widths) < 1:
-                raise ValueError(f"{name} must be three positive integers, got {widths}")
+        check_widths(feature_widths=feature_widths, generator_widths=generator_widths)
         check_norm_weights(norm_weights)
         self.norm_weights = norm_weights
         width = feature_widths[-1]

@@ -7,7 +7,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.layers.input_checks import check_norm_weights, check_vertices
+from training.networks.layers.input_checks import check_norm_weights, check_vertices, check_widths
 from training.networks.layers.modulation import (
     FFAdaIN,
     centred_for_autocast,
@@ -82,7 +82,8 @@ class DSFFNet(nn.Module):
         norm_weights: Literal["uniform", "area"] = "uniform",
     ) -> None:
         super().__init__()
-        _check_options(encoder_widths, decoder_widths, feature_fusion, target_side)
+        check_widths(encoder_widths=encoder_widths, decoder_widths=decoder_widths)
+        _check_sides(feature_fusion, target_side)
         check_norm_weights(norm_weights)
         self.norm_weights = norm_weights
         self.encoder = PoseEncoder(tuple(encoder_widths))
@@ -232,10 +233,7 @@ def _sum_with(first: Tensor, second: Tensor, weight: Tensor) -> Tensor:
     return rows.view(*first.shape[:2], weight.shape[0])
 
 
-def _check_options(encoder: tuple[int, ...], decoder: tuple[int, ...], feature_fusion: bool, target_side: bool) -> None:
-    for name, widths in (("encoder_widths", encoder), ("decoder_widths", decoder)):
-        if len(widths) != 3 or min(widths) < 1:
-            raise ValueError(f"{name} must be three positive integers, got {widths}")
+def _check_sides(feature_fusion: bool, target_side: bool) -> None:
     if not feature_fusion and not target_side:
         raise ValueError(
             "feature_fusion=False keeps only the target's side, which target_side=False removes: choose one"

@@ -7,7 +7,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor, nn
 
-from training.networks.layers.input_checks import check_norm_weights, check_vertices
+from training.networks.layers.input_checks import check_norm_weights, check_vertices, check_widths
 from training.networks.layers.modulation import (
     affine_map,
     full_precision,
@@ -85,8 +85,7 @@ class NPT(nn.Module):
         super().__init__()
         if variant not in ("maxpool", "origin"):
             raise ValueError(f"variant must be 'maxpool' or 'origin', got {variant!r}")
-        if len(encoder_widths) != 3 or min(encoder_widths) < 1:
-            raise ValueError(f"encoder_widths must be three positive integers, got {encoder_widths}")
+        check_widths(encoder_widths=encoder_widths)
         check_norm_weights(norm_weights)
         self.variant, self.norm_weights = variant, norm_weights
         self.encoder = PoseEncoder(tuple(encoder_widths))

@@ -39,6 +39,13 @@ def check_pair(source: Tensor, target: Tensor, dtype: torch.dtype) -> None:
         )
 
 
+def check_widths(**widths: tuple[int, ...]) -> None:
+    """Raise ValueError unless each option, called by its name, is three positive integers."""
+    for name, given in widths.items():
+        if len(given) != 3 or min(given) < 1:
+            raise ValueError(f"{name} must be three positive integers, got {given}")
+
+
 def check_norm_weights(name: str) -> None:
     """Raise ValueError unless `name` says how much vertices count in norms."""
     if name not in ("uniform", "area"):
