@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.chromium import Browser, chromium
 from tests.support.ranks import free_port
 from tests.support.workflows import finished_workflow
+from tests.workflows.chromium import Browser, chromium
 from training.tracking.mlflow_mirror import publish
 from training.tracking.mlflow_store import sqlite_server
 from training.tracking.record import begin_record, end_record, update_record

@@ -18,7 +18,7 @@ import trimesh
 from datagen.characters.motion import animation_names
 from datagen.mesh.files import load_mesh, read_mesh_file, save_mesh
 from datagen.mesh.sequences import write_animation
-from tests.support.chromium import Browser, chromium
+from tests.workflows.chromium import Browser, chromium
 from workflows.demo.bodies import mesh_of, random_figure
 from workflows.demo.poses import PERSON
 from workflows.demo.uploads import BYTE_LIMIT
