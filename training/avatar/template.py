@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_logits
 
@@ -21,7 +21,7 @@ from training.checkpoints.weights import read_weights, write_weights_atomically
 Network = Callable[[Tensor, Tensor], Tensor]
 """Logits [b, n] from points [b, n, 3] and poses [b, condition] (:class:`training.networks.template`)."""
 _SHARPNESS = 5.0
-_LEAST_SHARE = 0.01  # of the area: smaller pieces are crumbs
+_BARELY = 0.1  # share of its own distance to the surface by which a cell is moved across it
 _AT_ONCE = 2**15  # points whose logits are computed together
 
 
@@ -108,7 +108,7 @@ def near_surface_iou(network: Network, samples: FrameSamples, condition: Tensor)
 
 
 def extract_template(network: Network, condition: Tensor, field: SkinningField, *, cell: float = 0.015) -> Template:
-    """The surface where the logit is zero under a pose, within the field's box.
+    """The surface where the logit is zero under a pose, within the field's box: closed, a manifold, of one piece.
 
     Parameters
     ----------
@@ -130,9 +130,9 @@ def extract_template(network: Network, condition: Tensor, field: SkinningField, 
     outside[1:-1, 1:-1, 1:-1] = -logits[1:-1, 1:-1, 1:-1]
     if not (outside < 0).any():
         raise TrainingError("the template has no surface: nothing is occupied in the field's box. Train for longer")
-    at, faces = surface_nets(outside.astype(np.float64))
+    at, faces = surface_nets(one_piece(outside.astype(np.float64)))
     edge = ((field.high - field.low).numpy() / counts).astype(np.float64)
-    vertices, faces = _large_pieces(field.low.numpy() + (at + 0.5) * edge, faces)
+    vertices = field.low.numpy() + (at + 0.5) * edge
     points = torch.from_numpy(vertices).float()
     normals = torch.from_numpy(vertex_normals(vertices, faces)).float()
     return Template(points, torch.from_numpy(faces), normals, field.weights(points))
@@ -144,16 +144,46 @@ def _logits(network: Network, points: Tensor, condition: Tensor) -> Tensor:
     return torch.cat([network(points[None, first : first + _AT_ONCE], condition[None])[0] for first in firsts])
 
 
-def _large_pieces(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The connected pieces of a surface that have more than a hundredth of its area."""
-    first, second, third = faces.T
-    links = np.concatenate([first, second]), np.concatenate([second, third])
-    joined = scipy.sparse.coo_array((np.ones(len(links[0])), links), shape=(len(vertices),) * 2)
-    piece = scipy.sparse.csgraph.connected_components(joined, directed=False)[1][first]
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    kept = (np.bincount(piece, area) > _LEAST_SHARE * area.sum())[piece]
-    used, renumbered = np.unique(faces[kept], return_inverse=True)
-    return vertices[used], renumbered.reshape(-1, 3)
+def one_piece(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values [i, j, k], negative inside, with signs changed so that what is inside is one piece whose surface is a
+    manifold: smaller pieces and cavities go, and where cells inside touch by an edge or a corner alone those between
+    are filled.
+
+    A surface through cells that touch so has edges with four faces, or vertices where two sheets meet.
+    """
+    inside = _largest(values < 0, touching=3)
+    while True:
+        filled = ~_largest(~(inside | _between(inside)))
+        if (filled == inside).all():
+            break
+        inside = filled
+    changed = inside != (values < 0)
+    return np.where(changed, -_BARELY * values, values)
+
+
+def _largest(cells: NDArray[np.bool_], *, touching: int = 1) -> NDArray[np.bool_]:
+    """The largest set of cells that hang together: by their faces (1), or also by edges (2) and corners (3)."""
+    labels, _ = ndimage.label(cells, ndimage.generate_binary_structure(3, touching))
+    return labels == np.bincount(labels[cells]).argmax()
+
+
+def _between(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells of blocks of 2 x 2 or 2 x 2 x 2 in which two opposite ones alone are inside, or alone outside."""
+    found = np.zeros_like(inside)
+    for shape in ((1, 2, 2), (2, 1, 2), (2, 2, 1), (2, 2, 2)):
+        corners = list(np.ndindex(*shape))
+        blocks = np.stack([_shifted(inside, corner, shape) for corner in corners])
+        for start, corner in enumerate(corners[: len(corners) // 2]):
+            end = corners.index(tuple(size - 1 - at for size, at in zip(shape, corner, strict=True)))
+            opposite = blocks[start] & blocks[end]
+            others = np.delete(blocks, [start, end], axis=0)
+            touching = (opposite & ~others.any(axis=0)) | (~blocks[start] & ~blocks[end] & others.all(axis=0))
+            for each in corners:
+                _shifted(found, each, shape)[touching] = True
+    return found
+
+
+def _shifted(cells: NDArray[np.bool_], corner: tuple[int, ...], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The view of cells that stand at a corner of every block of a shape."""
+    steps = zip(corner, shape, cells.shape, strict=True)
+    return cells[tuple(slice(at, count - size + 1 + at) for at, size, count in steps)]

@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from datagen.common.errors import CheckpointError, TrainingError
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.surface_nets import surface_nets
 from tests.support.shapes.canonical import posed_leg
 from training.avatar.diffusion import SkinningField, diffused_skinning
 from training.avatar.occupancy import FrameSamples, frame_samples
@@ -17,6 +19,7 @@ from training.avatar.template import (
     Template,
     extract_template,
     near_surface_iou,
+    one_piece,
     plainest_pose,
     pose_condition,
     template_loss,
@@ -134,3 +137,31 @@ def test_a_leg_is_learned_from_its_poses(field: SkinningField) -> None:
     made = extract_template(network, plainest_pose(conditions), field)
     away = np.abs(Solid(leg.body.vertices, leg.body.faces).depth(made.vertices.numpy()))
     assert made.euler_characteristic == 2 and away.mean() < 0.025, "metres from the body"
+
+
+@pytest.mark.parametrize("case", ["an edge", "a corner", "a cavity's corner", "a crumb", "a cavity", "random"])
+def test_what_is_inside_becomes_one_piece_with_a_manifold_surface(case: str) -> None:
+    values = np.full((9, 9, 9), 1.0)
+    values[2:7, 2:7, 2:7] = -1
+    if case == "an edge":
+        values[2:4, 2:4] = values[4:7, 4:7] = 1
+    elif case == "a corner":
+        values[2:4, 2:4, 2:4] = -2
+        values[4:7, 2:4, 2:4] = values[2:4, 4:7, 2:4] = 1
+    elif case == "a cavity's corner":
+        values[3, 3, 3] = values[2, 2, 2] = values[4, 4, 4] = 1
+    elif case == "a crumb":
+        values[1, 1, 1] = -1  # touches the block by a corner
+    elif case == "a cavity":
+        values[4, 4, 4] = 3
+    else:
+        values[2:7, 2:7, 2:7] = np.random.default_rng(0).normal(size=(5, 5, 5))
+    made = one_piece(values)
+    surface = trimesh.Trimesh(*surface_nets(made), process=False)
+    assert surface.is_watertight and surface.body_count == 1
+    for vertex, faces in enumerate(surface.vertex_faces):
+        around = surface.faces[faces[faces >= 0]]
+        ring = around[around != vertex].reshape(-1, 2)
+        assert len(trimesh.graph.connected_components(ring)) == 1, "one fan of faces around every vertex"
+    assert (np.abs(made) <= np.abs(values)).all() and (made[values < 0] < 0).mean() > 0.5
+    assert (one_piece(made) == made).all()
