@@ -190,8 +190,8 @@ def _cells(dataset: Dataset, identities: Iterable[int] | None, poses: Iterable[i
 
 
 def _require_playable(names: _Names, cells: list[Cell]) -> None:
-    most = max(Counter(map(names.of, cells)).values())
-    if names.layout == "glb-animated" and most > FRAME_LIMIT:
+    most = max(Counter(map(names.of, cells)).values()) if names.layout == "glb-animated" else 0
+    if most > FRAME_LIMIT:
         raise MeshError(
             f"{most:,} poses of an identity are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere. "
             "Choose fewer by --poses"

@@ -60,16 +60,9 @@ def main(arguments: list[str] | None = None) -> None:
     with folder.alone():
         if options.fresh:
             folder.remove()
-        announce_times(recipe.data, _not_begun(recipe, folder))
         with Mirror(out, server):
             run_workflow(recipe, out, TaskRunner(local=options.local))
             print_text(closing_words(folder, server, beside=recipe.beside is not None))
-
-
-def _not_begun(recipe: WorkflowRecipe, folder: SingleRunFolder) -> dict[str, TrainingRecipe]:
-    """The trainings of which nothing is there yet; others say by themselves how long they will still take."""
-    trainings = {"train": (recipe.training, folder.run), "train-beside": (recipe.beside, folder.beside)}
-    return {name: training for name, (training, run) in trainings.items() if training and not has_record(run.path)}
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
@@ -97,6 +90,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     if recipe.beside:
         trainings.append((folder.beside, "train-beside", f"{MODEL}-beside", recipe.beside))
     refuse_conflicts(recipe.data, folder, {run.path: training for run, _, _, training in trainings})
+    announce_times(recipe.data, {name: training for run, name, _, training in trainings if not has_record(run.path)})
     with ExitStack() as around:
         begin = once(lambda: _begin(around, recipe, folder, tasks))
         evaluate = Stage(

@@ -1,6 +1,6 @@
 """The mesh of a GLB file as one of its animations moves it: by nodes, joints and morph targets (glTF 3.7, 3.11)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -47,6 +47,8 @@ class Motion:
         ------
         MeshError
             The file has none of that name, or it has more than FRAME_LIMIT frames.
+        BodyError
+            Its animations, meshes or skins are damaged.
         """
         content = file.content
         clips = _animations(content.gltf) if isinstance(content, GlbContent) else {}
@@ -74,6 +76,8 @@ class Motion:
         ------
         MeshError
             It is nothing that has a pose: flat there, or not finite.
+        BodyError
+            The animation is damaged there.
         """
         time = self.clip.start + frame / self.frames_per_second
         where = f"{self.file.path}, animation {self.clip.name!r} at {time:.2f} s"
@@ -106,14 +110,21 @@ class Motion:
 def _animations(file: Gltf) -> dict[str, Clip]:
     with reading(file.path, "its meshes and skins"):
         movers = _movers(file)
-    clips = read_clips(file, _PATHS)
-    return {name: clip for name, clip in clips.items() if any(node in movers for node, _ in clip.tracks)}
+        solids = set(solid_nodes(file).values())
+    moving = {}
+    for name, clip in read_clips(file, _PATHS).items():
+        kept = {at: track for at, track in clip.tracks.items() if at[0] in (solids if at[1] == "weights" else movers)}
+        if kept:  # the others move cameras, lights, or what is not there
+            starts, ends = zip(*((track.times[0], track.times[-1]) for track in kept.values()), strict=True)
+            moving[name] = replace(clip, tracks=kept, start=float(min(starts)), end=float(max(ends)))
+    return moving
 
 
 def _movers(file: Gltf) -> set[int]:
-    """Nodes that move a mesh: its own, its skin's joints, and all above these."""
-    found = set(solid_nodes(file).values())
-    skins = {file.nodes[node]["skin"] for node in found if "skin" in file.nodes[node]}
+    """Nodes that move a mesh: its own, or its skin's joints in the place of its own (3.7.3.3), and all above these."""
+    solids = set(solid_nodes(file).values())
+    found = {node for node in solids if "skin" not in file.nodes[node]}
+    skins = {file.nodes[node]["skin"] for node in solids - found}
     found |= {joint for skin in skins for joint in file.json["skins"][skin]["joints"]}
     for node in reversed(file.order):  # children before their parents
         if node in found and file.parents[node] >= 0:

@@ -1,6 +1,5 @@
 """How long a training step takes on this machine, tried before there are data."""
 
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,6 +8,7 @@ import torch
 from training.engine.optimization.optimizer import build_optimiser
 from training.networks import network_from
 from training.recipes.training import TrainingRecipe
+from training.tracking.provenance import cores
 
 _SECONDS = 1.0  # how long steps are tried, after a first one
 _LONG = 5.0  # a first step beyond which there is no second
@@ -25,7 +25,7 @@ def seconds_a_step(recipe: TrainingRecipe, *, vertices: int) -> float:
     share = -(-recipe.batch // recipe.ranks)
     tried = max(1, min(share, _VERTICES // vertices))
     before = torch.get_num_threads()
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // recipe.ranks))
+    torch.set_num_threads(max(1, cores() // recipe.ranks))
     try:
         with ThreadPoolExecutor(recipe.ranks) as ranks:
             found = [ranks.submit(_tried, recipe, tried, share / tried, vertices) for _ in range(recipe.ranks)]

@@ -62,7 +62,7 @@ def this_machine() -> dict[str, str]:
     import psutil  # a registered model, which reads the notes of others, comes without it
 
     facts = {
-        "processor": f"{_processor()}, {_cores()} cores",
+        "processor": f"{_processor()}, {cores()} cores",
         "memory": f"{psutil.virtual_memory().total / 2**30:.0f} GiB",
         "GPU": _gpus(),
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
@@ -87,7 +87,8 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _cores() -> int:
+def cores() -> int:
+    """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -93,7 +93,7 @@ def transfer_command(options: argparse.Namespace) -> None:
         if len(mesh.geometries) > 1:
             taken = f"{mesh.path}: {listed(mesh.geometries)} as one body ({option} chooses among them)"
             print_text(printable(taken))
-    animations = animation_names(job.sources[0]) if job.animation is None else ()
+    animations = animation_names(job.sources[0]) if job.animation is None and not job.is_sequence else ()
     if animations:
         print_text(
             printable(f"{source.path} is taken at rest; --animation NAME poses every frame of {listed(animations)}")

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from datagen.common.errors import DatasetError, RecipeError
+from datagen.common.resources import free_memory
 from datagen.recipe import DatasetRecipe
 from datagen.sizes import require_disk, size_of
 from datagen.store import open_dataset
@@ -69,20 +70,25 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
     """Say of each training how long it will take on this machine, by trying a few steps; see
     :func:`training.engine.step_time.seconds_a_step`.
 
-    Nothing is said of what others or GPUs do, of a body whose vertices only its files tell, and of what takes seconds.
+    Nothing is said of what others or GPUs do, of a body whose vertices only its files tell, of what takes seconds, and
+    of what memory has no room for, which the training itself refuses.
     """
+    from training.engine.step_time import seconds_a_step  # torch
+    from training.engine.tasks.transfer.transfer_task import least_step_bytes
+
     if recipe.body.expected_vertices is None or on_cluster():
         return
     total, vertices, grid = 0.0, round(recipe.body.expected_vertices), recipe.identities.training * recipe.poses.seen
     for name, training in trainings.items():
-        steps = training.last_step(grid // training.batch)
-        if steps * training.batch * (training.augmentation.subset or vertices) < _SOON or _on_gpu(training):
+        steps, shown = training.last_step(grid // training.batch), training.augmentation.subset or vertices
+        if steps * training.batch * shown < _SOON or _on_gpu(training):
+            continue
+        if least_step_bytes(training, shown, meshes=1, processes=training.ranks) > free_memory():
             continue
         say(f"{name}: trying a few steps, to tell how long {steps:,} will take here")
-        from training.engine.step_time import seconds_a_step  # torch
-
         seconds = seconds_a_step(training, vertices=vertices)
-        say(f"{name}: {_about(steps * seconds)}, {seconds:.2g} s a step")
+        budget = f", in commands of {training.budget} each" if training.budget else ""
+        say(f"{name}: {_about(steps * seconds)}, {seconds:.2g} s a step{budget}")
         total += steps * seconds
     if total:
         say(f"trainings: {_about(total)} in all; data, evaluation and report take a few minutes more")

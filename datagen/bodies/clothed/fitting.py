@@ -153,6 +153,10 @@ def _require_garment(places: NDArray[np.float64], faces: NDArray[np.int64], name
             f"{name} has {len(places):,} vertices, {len(places) * 4**subdivided:,} once subdivided {subdivided} times "
             f"(solver.subdivide), where {_MOST_VERTICES:,} can be draped. Simplify it"
         )
+    corners = places[faces]
+    flat = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(axis=1) < 4 * _NO_AREA**2
+    if flat.any():
+        raise BodyError(f"{name} has {flat.sum():,} faces without an area. Dissolve them, and export it again")
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, counts = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     if counts.max() > 2:
@@ -165,10 +169,6 @@ def _require_garment(places: NDArray[np.float64], faces: NDArray[np.int64], name
         raise BodyError(f"{name} is closed: nobody gets in. Remove the inner layer, or open its neck, waist and hems")
     if np.unique(sides, axis=0, return_counts=True)[1].max() > 1:
         raise BodyError(f"{name} has faces that are turned both ways. Let the normals of all look outwards")
-    corners = places[faces]
-    flat = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(axis=1) < 4 * _NO_AREA**2
-    if flat.any():
-        raise BodyError(f"{name} has {flat.sum():,} faces without an area. Dissolve them, and export it again")
     pieces = len(Surface(faces, scipy.sparse.eye_array(len(places), format="csr")).pieces(least=0.0))
     if pieces > 1:
         raise BodyError(f"{name} is in {pieces} pieces. Make each a part of the outfit, or choose one by `geometry`")

@@ -92,6 +92,29 @@ def test_a_node_above_the_mesh_moves_it(
     assert np.allclose([box.min(axis=0), box.max(axis=0)], [least, most], atol=1e-5)
 
 
+def test_cameras_that_move_longer_add_no_frames_and_one_that_moves_alone_is_no_motion(tmp_path: Path) -> None:
+    path = moving_box(tmp_path / "box.glb", "translation", [[0, 0, 0], [0, 4, 0]])
+    scene = Document()
+    times = scene.accessor([0.0, 9.0])
+    box = trimesh.creation.box()
+    attributes = {"POSITION": scene.accessor(box.vertices)}
+    keys = {"input": times, "output": scene.accessor([[0.0, 0, 0], [1.0, 0, 0]])}
+    short = {"input": scene.accessor(SECOND), "output": scene.accessor([[0.0, 0, 0], [0.0, 4, 0]])}
+    camera, own = ({"sampler": number, "target": {"node": number, "path": "translation"}} for number in (0, 1))
+    indices = scene.accessor(np.ravel(box.faces), "uint16")
+    scene.json |= {
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices}]}],
+        "nodes": [{"name": "camera"}, {"mesh": 0}],
+        "animations": [
+            {"name": "both", "samplers": [keys, short], "channels": [camera, own]},
+            {"name": "camera alone", "samplers": [keys], "channels": [camera]},
+        ],
+    }
+    both = scene.save(tmp_path / "both.glb")
+    assert animation_names(both) == ("both",)
+    assert motion(both, "both").count == motion(path, "move").count == 5
+
+
 def test_steps_and_cubic_curves(tmp_path: Path) -> None:
     steps = moving_box(tmp_path / "steps.glb", "translation", [[0, 0, 0], [0, 4, 0]], "STEP")
     assert np.allclose([motion(steps, "move").mesh(at).vertices.mean(axis=0)[1] for at in (3, 4)], [0, 4])

@@ -80,7 +80,7 @@ class TransferTask:
         return network_from(self._recipe.network)
 
     def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
-        """See :func:`training.engine.tasks.transfer.transfer_task.objective_of`."""
+        """See :func:`objective_of`."""
         return objective_of(network, self._recipe, device)
 
     @contextmanager
@@ -286,17 +286,21 @@ def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, room: Room, *,
     most = recipe.augmentation.subset or most
     meshes = math.ceil(recipe.batch / (ranks * recipe.accumulate))
     widths = _widths(recipe.network)
-    weights = room.sharers * _PARAMETER * _parameters(recipe.network)
-    of_a_mesh = room.sharers * _ACTIVATIONS * sum(widths) * most
-    needed = weights + meshes * of_a_mesh
+    needed = least_step_bytes(recipe, most, meshes=meshes, processes=room.sharers)
     if needed > room.free:
-        alone = weights + of_a_mesh > room.free
+        alone = least_step_bytes(recipe, most, meshes=1, processes=room.sharers) > room.free
         lower = "training.network's widths" if alone else "training.batch, or raise training.accumulate"
         raise RecipeError(
             f"a training step takes at least {bytes_text(needed)} ({meshes:,} meshes of {most:,} vertices at a time, "
             f"widths {', '.join(map(str, widths))}), but the {room.where} has {bytes_text(room.free)} free. "
             f"Lower {lower}"
         )
+
+
+def least_step_bytes(recipe: TrainingRecipe, vertices: int, *, meshes: int, processes: int) -> float:
+    """The memory that a step of so many meshes at a time takes at least, of processes that share it."""
+    of_a_mesh = _ACTIVATIONS * sum(_widths(recipe.network)) * vertices
+    return processes * (_PARAMETER * _parameters(recipe.network) + meshes * of_a_mesh)
 
 
 def _widths(network: NetworkRecipe) -> list[int]:
