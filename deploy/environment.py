@@ -42,7 +42,7 @@ def main() -> int:
         (VENV / ".ready").touch()
         say(f"{installed()} packages in .venv, after {time.monotonic() - began:.0f} s")
     else:
-        say("the packages could not be installed; the same command goes on from what was fetched")
+        say("the packages could not be installed; the same command resumes from what was fetched")
     return status
 
 

@@ -1,6 +1,6 @@
 """``python -m tests.fuzz``: thousands of cases, what they found grouped, and one case again.
 
-A worker process runs the cases; should one of them end the process itself, that is a finding, and a new worker goes on.
+A worker process runs the cases; should one of them end the process itself, that is a finding, and a new one continues.
 """
 
 import argparse

@@ -106,7 +106,7 @@ def _network_of_run(tree: Path) -> None:
 
 
 def _resume(tree: Path) -> None:
-    """Training goes on by two steps, on the dataset that it was trained on."""
+    """Training resumes for two steps, on the dataset that it was trained on."""
     from tests.support.recipes import tiny_training
     from training.engine.trainer import train
 
@@ -177,7 +177,7 @@ def _stages(tree: Path) -> None:
 
 
 def _began_again(tree: Path) -> None:
-    """The same command goes on with a run's record, whatever it finds."""
+    """The same command resumes a run's record, whatever it finds."""
     from training.tracking.record import begin_record, end_record, read_record, update_record
 
     begin_record(tree / "run", name="train", kind="train", parent=tree, parameters={})

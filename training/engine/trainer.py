@@ -125,7 +125,7 @@ def train(recipe: TrainingRecipe, *, data: str, run: Path, began: float | None =
                 return newest.step
             room = room_of(device, sharers=ranks.here)
             agreed(ranks, lambda: job.task.check(room, ranks.count), what="hold a step in memory")
-            # What learns must be gone before its process group is: see tests/support/one_rank.py.
+            # What learns must be gone before its process group is: see tests/support/ranks/one_rank.py.
             return _learn(job, device, stop, newest, _deadline(recipe, began or now))
 
 

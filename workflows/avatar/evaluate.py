@@ -111,7 +111,8 @@ def _measured(recipe: AvatarEvaluation, wardrobe: Wardrobe, network: nn.Module, 
         for kind in KINDS
     }
     usual = [_usual_displacement(wardrobe, network, number) for number in range(len(wardrobe.subjects))]
-    marked = [_footprints(wardrobe, network, number, its) for number, its in enumerate(usual)]
+    plainest = [_plainest(subject) for subject in wardrobe.subjects]
+    marked = [_footprints(wardrobe, network, number, plainest[number], its) for number, its in enumerate(usual)]
     with bar(total=sum(len(its) for its in frames.values()), what="evaluate", unit="frame") as shown:
         for (number, kind), its in frames.items():
             subject, footprints = wardrobe.subjects[number], marked[number]
@@ -125,18 +126,26 @@ def _measured(recipe: AvatarEvaluation, wardrobe: Wardrobe, network: nn.Module, 
                 for method, (mesh, normals) in meshes.items():
                     found = score(mesh, normals, scan, samples=recipe.samples, parts=subject.parts)
                     scores[method].append(found)
-                    away[method].append(1000 * footprints[method].distances(mesh.vertices, scan.vertices).mean())
+                    if frame != plainest[number]:
+                        away[method].append(1000 * footprints[method].distances(mesh.vertices, scan.vertices).mean())
                 shown.update()
             for method, its_scores in scores.items():
-                yield _means(subject.name, kind, method, its_scores, corresponding=float(np.mean(away[method])))
+                yield _means(
+                    subject.name, kind, method, its_scores, corresponding=float(np.mean(away[method] or np.nan))
+                )
 
 
-def _footprints(wardrobe: Wardrobe, network: nn.Module, number: int, usual: Floats) -> dict[str, Footprints]:
-    """Where on the cloth the points of each method lie in the seen pose that turns joints least."""
-    subject = wardrobe.subjects[number]
+def _plainest(subject: Subject) -> int:
+    """The seen pose that turns joints least."""
     turned = np.abs(subject.rotations[:, 1:]).sum(axis=(1, 2))
-    plainest = min(subject.seen, key=lambda frame: float(turned[frame]))
-    scan = outer_scan(subject, plainest)
+    return min(subject.seen, key=lambda frame: float(turned[frame]))
+
+
+def _footprints(
+    wardrobe: Wardrobe, network: nn.Module, number: int, plainest: int, usual: Floats
+) -> dict[str, Footprints]:
+    """Where on the cloth the points of each method lie in the plainest pose, which itself says nothing of sliding."""
+    scan = outer_scan(wardrobe.subjects[number], plainest)
     meshes = _methods(wardrobe, network, number, plainest, usual)
     return {method: Footprints.of(mesh.vertices, scan) for method, (mesh, _) in meshes.items()}
 

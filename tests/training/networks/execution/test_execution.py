@@ -1,6 +1,6 @@
 """How a network is run does not change what it computes, beyond the rounding that was asked for.
 
-On a machine with torch and pytest alone: ``pytest --noconftest -m gpu tests/training/networks/test_execution.py``.
+With torch and pytest alone: ``pytest --noconftest -m gpu tests/training/networks/execution/test_execution.py``.
 """
 
 import gc
