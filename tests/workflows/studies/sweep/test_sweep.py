@@ -457,7 +457,7 @@ def test_stopped_and_killed_on_real_ray_it_ends_as_if_undisturbed_and_mlflow_sho
     assert {r.info.status for r in runs} == {"FINISHED"}
     assert children["learning_rate=0.001"].data.tags["varied.training.learning_rate"] == "0.001"
     assert "evaluation/pmd_unseen" in children["learning_rate=0.001"].data.metrics
-    assert {"sweep.md", "sweep.csv", "figures"} <= {file.path for file in client.list_artifacts(parent.info.run_id)}
+    assert {"sweep.md", "sweep.csv", "sweep.png"} <= {file.path for file in client.list_artifacts(parent.info.run_id)}
 
 
 @pytest.mark.cluster
