@@ -73,7 +73,7 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
         ahead = upright @ turn
         if (left := misfit(understand, ahead)) > STRANGE:
             raise MeshError(
-                f"mesh {number} (from 0) is no body whose pose these weights know (misfit {left:.3f}, more than "
+                f"mesh {number} is no body whose pose these weights know (misfit {left:.3f}, more than "
                 f"{STRANGE}). Look at it, or leave it out"
             )
         vertices = torch.from_numpy(bounding_box(ahead).normalise(ahead).astype(np.float32))[None]
