@@ -25,11 +25,13 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help run test test-cluster test-slow fuzz lint docs bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
+.PHONY: help install run test test-cluster test-slow fuzz lint docs bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
+
+install: $(READY) ## the environment alone, .venv: enough to pose your own meshes
 
 run: $(READY) ## the quickstart: generate data, train, evaluate, show (about 10 minutes on 2 cores)
 	@$(BIN)/python workflows/full.py $(ARGS)

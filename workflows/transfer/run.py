@@ -172,8 +172,8 @@ class TransferWork:
 
     def _write_posed(self, posed: Mesh, out: Path, *, beside: bool = True) -> None:
         lost = write_posed(self.target, posed.vertices, out, beside=beside)
-        for line in lost if beside else ():
-            warn(line)
+        if lost and beside:
+            warn(f"{out.name} does not keep: {'; '.join(lost)}")
 
     def posed(self) -> Iterator[Mesh]:
         """The target in the pose of every source, one after the other."""
