@@ -33,7 +33,7 @@ help: ## this list
 
 install: $(READY) ## the environment alone, .venv: enough to pose your own meshes
 
-run: $(READY) ## the quickstart: generate data, train, evaluate, show (about 10 minutes on 2 cores)
+run: $(READY) ## the quickstart: generate data, train, evaluate, show (about 12 minutes on 2 cores)
 	@$(BIN)/python workflows/full.py $(ARGS)
 
 test: $(READY) ## the test suite

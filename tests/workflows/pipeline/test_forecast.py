@@ -69,6 +69,7 @@ def test_examples_that_are_too_many_to_try_are_counted(monkeypatch: pytest.Monke
     clock = iter(range(1000))
     monkeypatch.setattr(step_time, "_SECONDS", 0.0)
     monkeypatch.setattr(step_time, "_VERTICES", 40)
+    monkeypatch.setattr(step_time, "_MORE", 1.0)
     monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
     few, many = (seconds_a_step(tiny_training(batch=batch), vertices=20) for batch in (2, 8))
     assert (few, many) == (1 + 1, 4 + 1)  # one second each way, forward and back of a batch of two, the optimiser
