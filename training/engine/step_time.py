@@ -17,7 +17,7 @@ _VERTICES = 4096  # of the meshes of a trial: examples beyond them are counted, 
 
 
 def seconds_a_step(recipe: TrainingRecipe, *, vertices: int) -> float:
-    """Seconds of a step of so many vertices a mesh on this machine's CPU, all ranks working at once, as a mean over a run.
+    """Seconds of a step of so many vertices a mesh on this machine's CPU, all ranks at work, as a mean of a run.
 
     Random vertices go forward and back through a network of the recipe's, and its optimiser takes a step. Ranks are
     threads here, which share the cores as processes do.
