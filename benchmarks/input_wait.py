@@ -25,7 +25,7 @@ from torch import nn
 from datagen.generate import generate
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
-from training.data.order import TripleOrder
+from training.data.triples import TripleOrder
 from training.data.vertex_bank import VertexBank, open_bank
 from training.data.vertex_layout import Layout
 from training.networks.dsffnet import DSFFNet

@@ -62,7 +62,7 @@ def by_pip(python: Path) -> list[str]:
     index = os.environ.get("TORCH_INDEX", "") or ("" if has_own_indexes(python) else cpu_index())
     if index:
         say(f"torch is looked for at {index}, too")
-    # Python compiles what is imported, some tenth of all; pip would compile everything: most of the time that it takes
+    # Python compiles what is imported; pip would compile everything, which is most of the time that it takes
     flags = [
         "--disable-pip-version-check",
         "--progress-bar",

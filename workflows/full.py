@@ -44,10 +44,10 @@ from workflows.pipeline.forecast import announce_size, announce_times
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
-from workflows.pipeline.stage import Stage, mark_of, once, recorded, run_stage
+from workflows.pipeline.stage import Stage, begin_workflow, mark_of, once, run_stage
 from workflows.pipeline.tasks import TaskRunner
 from workflows.pipeline.train import is_trained, refuse_conflicts, train_model
-from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
+from workflows.recipe.loader import WorkflowRecipe, load_recipe
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -92,7 +92,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     refuse_conflicts(recipe.data, folder, {run.path: training for run, _, _, training in trainings})
     announce_times(recipe.data, {name: training for run, name, _, training in trainings if not has_record(run.path)})
     with ExitStack() as around:
-        begin = once(lambda: _begin(around, recipe, folder, tasks))
+        begin = once(lambda: begin_workflow(around, recipe, folder, tasks))
         evaluate = Stage(
             "evaluate",
             depends_on=[sections[name] for name in ("data", "training", "beside", "evaluation") if name in sections],
@@ -131,15 +131,6 @@ def _training_stage(
         intact=lambda: is_trained(training, folder.data, run.path) and has_record(run.path),
         work=work,
     )
-
-
-def _begin(around: ExitStack, recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:
-    """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a place for tasks."""
-    out, parameters = folder.path, recipe.model_dump(mode="json")
-    save_recipe(recipe, folder.recipe)
-    around.enter_context(recorded(out, kind=folder.kind, name=out.name, parent=None, parameters=parameters))
-    update_record(out, artifacts=["recipe.yaml"])
-    around.enter_context(tasks)
 
 
 def _evaluate(recipe: WorkflowRecipe, folder: SingleRunFolder, tasks: TaskRunner) -> None:

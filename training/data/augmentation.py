@@ -14,8 +14,8 @@ from torch import Tensor
 
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
-from training.data.order import Triples
 from training.data.proportions import of_other_proportions
+from training.data.triples import Triples
 from training.networks.layers.rigid_parts import about_vertical
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
@@ -45,7 +45,7 @@ class Augmentation:
         step
             Steps done before this one.
         first
-            Place of the batch's first triple in the whole batch (:meth:`training.data.order.TripleOrder.places`).
+            Place of the batch's first triple in the whole batch (:meth:`training.data.triples.TripleOrder.places`).
         """
         recipe, device = self._recipe, batch.source.device
         if recipe == AugmentationRecipe(shuffle=recipe.shuffle):

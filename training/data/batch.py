@@ -12,7 +12,7 @@ from torch import Tensor
 from datagen.common.errors import DatasetError
 from datagen.mesh.geometry import edges_of
 from datagen.store import Dataset
-from training.data.order import Triples
+from training.data.triples import Triples
 from training.data.vertex_layout import normalised
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.losses import INCIDENCES, PackedEdges, incidence_of, join_incidences, loss_edges

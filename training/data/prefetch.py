@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 
 from training.data.batch import Batch
-from training.data.order import Triples
+from training.data.triples import Triples
 
 Share = list[Triples]
 """A rank's part of a batch of triples, in the parts that it accumulates over."""

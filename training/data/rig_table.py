@@ -16,7 +16,7 @@ from datagen.mesh.geometry import edges_of
 from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
 from datagen.store import Dataset
 from training.data.batch import Batch
-from training.data.order import Triples
+from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers import rigid_parts
 from training.networks.layers.rigid_parts import ancestors, moved_joints

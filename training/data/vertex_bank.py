@@ -22,9 +22,9 @@ from datagen.common.resources import bytes_text
 from datagen.store import Dataset
 from training.data.batch import Batch, EdgeSum, EdgeTable, counts_of
 from training.data.cache_policy import Cache, Choice, choose, room_of, stream_memory
-from training.data.order import Triples
 from training.data.prefetch import Share, prepared_ahead
 from training.data.streaming_cache import StreamedMeshes
+from training.data.triples import Triples
 from training.data.vertex_layout import Layout, decode
 from training.networks.execution import sent
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.common.files import write_atomically
-from training.engine.resume import Job, State
+from training.engine.state import Job, State
 from training.engine.tasks.protocol import Validation
 from training.engine.train_step import Learner
 from training.tracking.journal import Journal

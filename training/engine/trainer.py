@@ -36,7 +36,8 @@ from training.engine.distributed import (
 )
 from training.engine.nonfinite import RecentStep, broken_step, stop_for
 from training.engine.observer import Meter, Observer, observing
-from training.engine.resume import Job, State, begin, checkpoint_to_resume
+from training.engine.resume import begin, checkpoint_to_resume
+from training.engine.state import Job, State
 from training.engine.tasks.registry import task_of
 from training.recipes.training import TrainingRecipe, budget_seconds
 

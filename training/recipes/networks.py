@@ -1,5 +1,6 @@
 """The networks of a training recipe: one class a network, told apart by ``name``."""
 
+from abc import ABC, abstractmethod
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
@@ -18,13 +19,13 @@ NormWeights = Annotated[
 ]
 
 
-class NetworkSection(Frozen):
+class NetworkSection(Frozen, ABC):
     """Base of the sections of networks."""
 
     @property
+    @abstractmethod
     def title(self) -> str:
         """What tables call the network: the paper's name, with what is left out or differs after it."""
-        raise NotImplementedError
 
     @property
     def needs_equal_counts(self) -> bool:

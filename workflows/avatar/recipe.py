@@ -11,7 +11,8 @@ from datagen.recipe import ClothedBody, DatasetRecipe, Frozen
 from datagen.recipe.text import changed, parse_words, read_values, require_plain
 from training.recipes.networks import AvatarRecipe, TemplateRecipe
 from training.recipes.training import TrainingRecipe
-from workflows.recipe.loader import file_of, known_files, recipe_faults, with_absolute_paths
+from workflows.recipe.loader import recipe_faults, with_absolute_paths
+from workflows.recipe.names import file_of, known_files
 
 
 class FieldRecipe(Frozen):

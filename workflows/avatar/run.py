@@ -7,16 +7,15 @@ from datagen.common.errors import CheckpointError, RecipeError
 from datagen.store import open_dataset
 from training.avatar.outfit import outfits_in
 from training.avatar.template import extract_template, plainest_pose
-from training.tracking.record import has_record, update_record
+from training.tracking.record import has_record
 from workflows.avatar.evaluate import evaluate_avatar
 from workflows.avatar.outfits import MADE, is_of, make_outfits
 from workflows.avatar.recipe import AvatarWorkflow, load_avatar
 from workflows.avatar.runs import is_learned, learn, trained
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.run_folder import AvatarFolder
-from workflows.pipeline.stage import Stage, once, recorded, run_stage, say
+from workflows.pipeline.stage import Stage, begin_workflow, once, run_stage, say
 from workflows.pipeline.tasks import TaskRunner
-from workflows.recipe.loader import save_recipe
 
 
 def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
@@ -27,7 +26,7 @@ def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
     of_points = [*of_templates, values["avatar"]]
     _refuse_conflicts(recipe, folder)
     with ExitStack() as around:
-        begin = once(lambda: _begin(around, recipe, folder, tasks))
+        begin = once(lambda: begin_workflow(around, recipe, folder, tasks))
         stages = (
             generate_stage(recipe.data, folder, tasks),
             Stage(
@@ -57,14 +56,6 @@ def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
         )
         for stage in stages:
             run_stage(stage, out=out, before=begin)
-
-
-def _begin(around: ExitStack, recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner) -> None:
-    out, parameters = folder.path, recipe.model_dump(mode="json")
-    save_recipe(recipe, folder.recipe)
-    around.enter_context(recorded(out, kind=folder.kind, name=out.name, parent=None, parameters=parameters))
-    update_record(out, artifacts=["recipe.yaml"])
-    around.enter_context(tasks)
 
 
 def _refuse_conflicts(recipe: AvatarWorkflow, folder: AvatarFolder) -> None:

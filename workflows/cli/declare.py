@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from workflows.recipe.loader import known_recipes
+from workflows.recipe.names import known_recipes
 
 Parser = argparse.ArgumentParser
 _WORDS = ("result", "latest", "best")

@@ -74,7 +74,7 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
     of what memory has no room for, which the training itself refuses.
     """
     from training.engine.step_time import seconds_a_step  # torch
-    from training.engine.tasks.transfer.transfer_task import least_step_bytes
+    from training.engine.tasks.transfer.step_memory import least_step_bytes
 
     if recipe.body.expected_vertices is None or on_cluster():
         return

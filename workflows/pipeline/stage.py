@@ -4,18 +4,20 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 from typing_extensions import TypedDict
 
 from datagen.common.errors import TrainingStopped
 from datagen.common.files import read_json_if_whole, refuse_links_out, write_atomically
 from datagen.common.printable import printable
-from training.tracking.record import begin_record, end_record, flatten
+from training.tracking.record import begin_record, end_record, flatten, update_record
+from workflows.pipeline.run_folder import WorkflowFolder
+from workflows.recipe.loader import save_recipe
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,17 @@ def recorded(folder: Path, *, kind: str, name: str, parent: Path | None, paramet
         end_record(folder, "FAILED")
         raise
     end_record(folder, "FINISHED")
+
+
+def begin_workflow(
+    around: ExitStack, recipe: BaseModel, folder: WorkflowFolder, tasks: AbstractContextManager[Any]
+) -> None:
+    """What the first stage with work to do needs: the resolved recipe on disk, a parent record, a place for tasks."""
+    out, parameters = folder.path, recipe.model_dump(mode="json")
+    save_recipe(recipe, folder.recipe)
+    around.enter_context(recorded(out, kind=folder.kind, name=out.name, parent=None, parameters=parameters))
+    update_record(out, artifacts=["recipe.yaml"])
+    around.enter_context(tasks)
 
 
 def once(work: Callable[[], None]) -> Callable[[], None]:

@@ -14,7 +14,7 @@ from datagen.store import Dataset, open_dataset
 from datagen.store.attributes import check_same_recipe
 from datagen.store.schema import open_group
 from training.checkpoints.checkpoint import is_finished, load_checkpoint, require_checkpoint
-from training.data.order import last_step_of, order_of
+from training.data.triples import last_step_of, order_of
 from training.engine.launch import launch
 from training.engine.resume import require_same_training
 from training.evaluation.document import plain

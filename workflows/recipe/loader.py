@@ -1,6 +1,5 @@
-"""The recipe of a whole workflow: those that come along, its sections, overrides, and errors a person can act on."""
+"""The recipe of a whole workflow: its sections, overrides, and errors a person can act on."""
 
-import difflib
 import os
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -17,60 +16,7 @@ from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_w
 from training.recipes.networks import AvatarRecipe, TemplateRecipe
 from training.recipes.training import DEFAULT_NETWORK, EvaluationRecipe, TrainingRecipe
 from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
-
-_FOLDER = Path(__file__).parents[1] / "recipes"
-
-
-def known_files(kind: str = "") -> dict[str, Path]:
-    """Files that come with the project, by name: of whole recipes, or those in the folder of a ``kind``."""
-    return {path.stem: path for path in sorted((_FOLDER / kind).glob("*.yaml"))}
-
-
-def known_recipes() -> dict[str, Path]:
-    """Files of whole recipes, by name."""
-    return dict(sorted((known_files() | known_files("clothed") | known_files("papers")).items()))
-
-
-def known_trainings() -> dict[str, Path]:
-    """Files of published training recipes, by name: ``training: NAME`` means what one says in that section."""
-    return known_files("training")
-
-
-def file_of(name_or_file: str, known: dict[str, Path], *, what: str) -> Path:
-    """The known file of that name, or the YAML file itself.
-
-    Raises
-    ------
-    RecipeError
-        There is none of that name, and it is no name of a YAML file; the nearest and all others are named.
-    """
-    path = known.get(name_or_file, Path(name_or_file))
-    if path.suffix not in (".yaml", ".yml"):
-        raise RecipeError(
-            f"no {what} {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}, "
-            "or give a YAML file"
-        )
-    return path
-
-
-def named_training(name: str) -> dict[str, Any]:
-    """The training section of that name.
-
-    Raises
-    ------
-    RecipeError
-        There is none; the nearest and all others are named.
-    """
-    known = known_trainings()
-    if name not in known:
-        raise RecipeError(f"no training recipe {name!r}{nearest(name, list(known))}; there are {', '.join(known)}")
-    return dict(read_values(known[name])["training"])
-
-
-def nearest(name: str, known: list[str]) -> str:
-    """Words that suggest the known name nearest to one that is not, or none."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    return f", did you mean {close[0]!r}?" if close else ""
+from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
 
 
 def with_absolute_paths(values: Any, folder: Path) -> Any:
@@ -249,6 +195,8 @@ def describe_fields(
 
 
 _OF_AVATARS = (TemplateRecipe, AvatarRecipe)
+
+
 _KINDS = (
     ("data.body", "family", None),
     ("data.poses.distribution", "name", None),
@@ -325,6 +273,8 @@ def _parts(annotation: Any) -> Iterator[Any]:
 
 
 _NO_SECTIONS = "is not a mapping of sections (data, training, beside, evaluation), or is empty"
+
+
 _UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
 
 

@@ -111,7 +111,7 @@ def test_the_recipe_it_was_first_made_by_does_not_shrink_it(spoilable: Path) -> 
 
 def test_training_sees_appended_identities_and_poses(spoilable: Path) -> None:
     """The bank and the order of triples go by pose number, also where a pose's row is another number."""
-    from training.data.order import TripleOrder
+    from training.data.triples import TripleOrder
     from training.data.vertex_bank import open_bank
 
     grown = append(str(spoilable), training=4, seen=9)

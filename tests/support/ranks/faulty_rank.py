@@ -4,9 +4,9 @@ import os
 from typing import Any
 
 from training.engine import launch
-from training.engine.tasks.transfer import transfer_task
+from training.engine.tasks.transfer import objective
 
-_real = transfer_task.transfer_loss
+_real = objective.transfer_loss
 _calls = 0
 
 
@@ -20,5 +20,5 @@ def _faulty(*arguments: Any, **keywords: Any) -> Any:
 
 
 if __name__ == "__main__":
-    transfer_task.transfer_loss = _faulty
+    objective.transfer_loss = _faulty
     launch.main()

@@ -14,8 +14,8 @@ from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation, Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
-from training.data.order import TripleOrder
 from training.data.rig_table import RigTable
+from training.data.triples import TripleOrder
 from training.data.vertex_bank import open_bank
 from training.networks.dsffnet import DSFFNet
 from training.networks.layers.surface import surface_of

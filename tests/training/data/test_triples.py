@@ -15,7 +15,7 @@ from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import mixed_dataset, tiny_dataset
-from training.data.order import TripleOrder, epoch_triples
+from training.data.triples import TripleOrder, epoch_triples
 from training.data.vertex_bank import open_bank
 
 

@@ -19,8 +19,8 @@ from tests.support.recipes import mixed_dataset, tiny_dataset
 from tests.training.data.test_batch import same
 from training.data.batch import Batch
 from training.data.cache_policy import Room, choose, room_of
-from training.data.order import TripleOrder
 from training.data.prefetch import Share
+from training.data.triples import TripleOrder
 from training.data.vertex_bank import VertexBank, open_bank
 from training.objectives.losses import transfer_loss
 

@@ -13,8 +13,8 @@ from datagen.generate import generate
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.engine import trainer
 from training.engine.distributed import STOP_FILE, Ranks, agreed, decided_by_first
-from training.engine.resume import Verdict
-from training.engine.tasks.transfer import transfer_task
+from training.engine.state import Verdict
+from training.engine.tasks.transfer import transfer_task, validation
 from training.engine.trainer import train
 
 ALONE = Ranks(0, 1, 0)
@@ -88,7 +88,7 @@ def test_a_picture_that_cannot_be_written_is_a_warning(dataset: str, tmp_path: P
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(transfer_task, "draw_snapshot", full)
+    monkeypatch.setattr(validation, "draw_snapshot", full)
     assert train(tiny_training(picture_every=4), data=dataset, run=tmp_path) == 8
     assert "no picture of step 4" in caplog.text and "No space left" in caplog.text
 

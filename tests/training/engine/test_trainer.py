@@ -103,10 +103,13 @@ def test_a_finished_run_is_left_alone(dataset: str, undisturbed: Path) -> None:
     assert (undisturbed / "metrics.jsonl").read_bytes() == before
 
 
-def test_nan_on_one_rank_stops_both_before_the_step(dataset: str, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("optimiser", ["adamw", "muon"])
+def test_nan_on_one_rank_stops_both_before_the_step(
+    optimiser: str, dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FAULT_RANK", "1")
     monkeypatch.setenv("FAULT_STEP", "7")
-    recipe = tiny_training(launcher="ray", ranks=2)
+    recipe = tiny_training(launcher="ray", ranks=2, optimiser=optimiser)
     started = start_ranks(recipe, data=dataset, run=tmp_path / "run", count=2, module="tests.support.ranks.faulty_rank")
     (first, said), (second, said_by_culprit) = finish(started)
     assert first and second

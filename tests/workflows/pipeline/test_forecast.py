@@ -73,3 +73,14 @@ def test_examples_that_are_too_many_to_try_are_counted(monkeypatch: pytest.Monke
     monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
     few, many = (seconds_a_step(tiny_training(batch=batch), vertices=20) for batch in (2, 8))
     assert (few, many) == (1 + 1, 4 + 1)  # one second each way, forward and back of a batch of two, the optimiser
+
+
+@pytest.mark.parametrize(("ranks", "seconds"), [(1, 1 + 1), (2, 1 + 1 / 2)])
+def test_ranks_share_the_time_that_moving_matrices_takes(
+    ranks: int, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(1000))
+    monkeypatch.setattr(step_time, "_SECONDS", 0.0)
+    monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
+    recipe = tiny_training(optimiser="muon", batch=2, ranks=ranks, launcher="ray")
+    assert step_time._tried(recipe, 1, 1.0, 20) == seconds

@@ -224,6 +224,26 @@ def test_a_process_that_is_ended_within_its_ray_has_last_words(inside: str, stat
     assert said == "" or ended.stderr.endswith("run the same command again to resume\n")
 
 
+def test_a_block_that_heeds_no_interruption_is_ended_with_the_same_words() -> None:
+    """A call to a dead server may wait for ever."""
+    script = (
+        "import psutil, ray, signal, subprocess, time; ray.init = lambda **_: None\n"
+        "from workflows.pipeline import own_ray\n"
+        "server = psutil.Process(subprocess.Popen(['sleep', '600']).pid)\n"
+        "server.name = lambda: 'raylet'\n"
+        "own_ray._family, own_ray._LOOK_SECONDS, own_ray._LEAVE_SECONDS = (lambda: [server]), 0.1, 0.5\n"
+        "with own_ray.own_ray():\n"
+        "    signal.signal(signal.SIGUSR1, signal.SIG_IGN)\n"
+        "    server.kill()\n"
+        "    time.sleep(600)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script], check=False, cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert ended.returncode == ClusterError.exit_status
+    assert ended.stderr.startswith("error: Ray's raylet has died") and len(ended.stderr.splitlines()) == 1
+
+
 def _raise(error: type[BaseException]) -> None:
     raise error
 

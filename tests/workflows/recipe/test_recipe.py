@@ -9,14 +9,8 @@ from hypothesis import strategies as st
 
 from datagen.common.errors import RecipeError
 from training.recipes.training import PATH_KEYS, TrainingRecipe
-from workflows.recipe.loader import (
-    WorkflowRecipe,
-    describe_fields,
-    known_recipes,
-    known_trainings,
-    load_recipe,
-    save_recipe,
-)
+from workflows.recipe.loader import WorkflowRecipe, describe_fields, load_recipe, save_recipe
+from workflows.recipe.names import known_recipes, known_trainings
 
 
 @pytest.mark.parametrize("name", sorted(known_recipes()))

@@ -12,7 +12,8 @@ from datagen.common.errors import RecipeError
 from datagen.common.printable import printable
 from datagen.recipe import Frozen
 from datagen.recipe.text import faults_text, read_values
-from workflows.recipe.loader import WorkflowRecipe, file_of, known_files
+from workflows.recipe.loader import WorkflowRecipe
+from workflows.recipe.names import file_of, known_files
 from workflows.studies.sweep.plan import Sweep, Trial, TrialEntry, resolve
 
 ComparisonKind = Literal["comparison", "ablation"]

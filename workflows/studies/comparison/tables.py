@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from datagen.store import Dataset
-from training.data.order import last_step_of
+from training.data.triples import last_step_of
 from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.evaluate import Row
 from training.evaluation.paper_numbers import PaperData

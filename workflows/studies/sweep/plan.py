@@ -18,7 +18,8 @@ from datagen.recipe import Frozen
 from datagen.recipe.text import faults_text, read_values
 from training.recipes.training import TrainingRecipe
 from training.tracking.record import flatten
-from workflows.recipe.loader import WorkflowRecipe, file_of, known_files, load_recipe
+from workflows.recipe.loader import WorkflowRecipe, load_recipe
+from workflows.recipe.names import file_of, known_files
 
 _OPENING, _CLOSING = "[{(", "]})"
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 from datagen.common.errors import TrainingStopped, WorkflowError
 from datagen.common.files import read_text_within
 from datagen.store import open_dataset
-from training.data.order import last_step_of
+from training.data.triples import last_step_of
 from training.evaluation.run_curves import PMD_UNIT
 from training.tracking.record import has_record, read_record, update_record
 from workflows.pipeline.generate import generate_stage

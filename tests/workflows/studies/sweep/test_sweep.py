@@ -31,7 +31,8 @@ from training.recipes.training import TrainingRecipe
 from training.tracking.journal import read_journal
 from training.tracking.record import flatten, read_record
 from workflows.pipeline.run_folder import SweepFolder
-from workflows.recipe.loader import WorkflowRecipe, load_recipe, named_training, save_recipe
+from workflows.recipe.loader import WorkflowRecipe, load_recipe, save_recipe
+from workflows.recipe.names import named_training
 from workflows.studies.sweep import run as sweeping
 from workflows.studies.sweep.plan import Sweep, Trial, known_sweeps, parse_grid, plan_sweep, read_sweep, split_values
 from workflows.studies.sweep.ray_trials import Outcome, Place, ray_trials, train_trial

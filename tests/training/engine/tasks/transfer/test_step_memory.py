@@ -15,7 +15,7 @@ from tests.support.commands import ROOT
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.data.cache_policy import Room
-from training.engine.tasks.transfer.transfer_task import require_step_memory
+from training.engine.tasks.transfer.step_memory import require_step_memory
 from training.engine.train_step import Learner
 from training.engine.trainer import train
 from training.evaluation import evaluate as evaluation
