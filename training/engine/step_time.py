@@ -10,7 +10,7 @@ from training.networks import network_from
 from training.recipes.training import TrainingRecipe
 from training.tracking.provenance import cores
 
-_MORE = 1.5  # starts, batches, losses and measurements beside: the quickstart's two trainings took 1.6 and 1.7 times
+_MORE = 1.6  # starts, batches, losses and measurements beside: the quickstart's two trainings took 1.6 and 1.7 times
 _SECONDS = 1.0  # how long steps are tried, after a first one
 _LONG = 5.0  # a first step beyond which there is no second
 _VERTICES = 4096  # of the meshes of a trial: examples beyond them are counted, not tried
@@ -53,5 +53,4 @@ def _tried(recipe: TrainingRecipe, examples: int, times: float, vertices: int) -
         seconds.append((between - start) * times + moving)
         if seconds[0] > _LONG:
             return seconds[0]
-    later = seconds[1:]  # the first one also allocates
-    return sum(later) / len(later)
+    return min(seconds[1:])  # the first one also allocates; what else the machine does for a moment makes others longer

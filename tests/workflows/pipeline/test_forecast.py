@@ -61,7 +61,7 @@ def test_steps_of_every_kind_are_tried_and_nothing_of_it_stays(
     given = {"network": {"name": network}, "augmentation": {"subset": 20}, "edge_weight": 0}
     recipe = tiny_training(**given, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
     before = torch.get_num_threads()
-    assert 0 < seconds_a_step(recipe, vertices=20) < 60
+    assert seconds_a_step(recipe, vertices=20) > 0
     assert torch.get_num_threads() == before
 
 
