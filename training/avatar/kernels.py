@@ -1,8 +1,7 @@
 """Warp's kernels of :mod:`training.avatar.solid`, compiled for any CPU."""
 
-import warp as wp
+from datagen.common.quiet_warp import wp
 
-wp.config.log_level = 40  # errors only: it would greet with the devices that it finds
 wp.set_module_options({"enable_backward": False, "fuse_fp": False, "fast_math": False, "cpu_compiler_flags": ""})
 _FAR = wp.constant(1e6)
 

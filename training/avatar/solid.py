@@ -7,10 +7,10 @@ half. So meshes may have holes, as garments have: an open tube counts as filled 
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from datagen.common.arrays import Floats
+from datagen.common.quiet_warp import wp
 from training.avatar.kernels import depth, seen
 
 _DIRECTIONS = 64

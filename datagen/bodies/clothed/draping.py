@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import scipy.spatial
-import warp as wp
 from numpy.typing import NDArray
 
 from datagen.bodies.clothed.garments import Garment
 from datagen.bodies.clothed.kernels import STEP, Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
 from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
+from datagen.common.quiet_warp import wp
 from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 

@@ -4,7 +4,7 @@ A kernel that takes steps goes through the constraints one after another, in a f
 or atomics. All are compiled for any CPU, without fused multiply-adds, so that the bytes are the same on all of them.
 """
 
-import warp as wp
+from datagen.common.quiet_warp import wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False, "fast_math": False, "cpu_compiler_flags": ""})
 
