@@ -236,12 +236,14 @@ def _describe(fault: Any, listed: set[str] | None) -> str:
         known = [line.split()[0] for line in describe_fields()]
         if key.startswith("beside."):
             known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
-        if key in known:
-            return f"{key!r} is a key of another kind of {key.rpartition('.')[0]!r} than the one chosen"
         section, keys = key.rpartition(".")[0], ""
         if listed is not None and section not in listed:
             listed.add(section)
             keys = _its_keys(location, section)
+        if any(name == key or name.startswith(f"{key}.") for name in known):
+            having = _members(section, having=location[-1])
+            whose = f"of {', '.join(having)}" if having else f"of another kind of {section!r}"
+            return f"{key!r} is a key {whose}, not of the one chosen{keys}"
         return f"unknown key {shown(key)}{nearest(key, known)}{keys}"
     return fault_text(fault, key=key)
 
@@ -278,13 +280,17 @@ _NO_SECTIONS = "is not a mapping of sections (data, training, beside, evaluation
 _UNIONS = {section.rpartition(".")[2] for section, _, _ in _KINDS}
 
 
-def _members(section: str, key: str) -> Iterator[str]:
-    """What the ``key`` of a section that has several kinds may say."""
-    *way, last = section.split(".")
+def _members(section: str, *, having: str = "") -> list[str]:
+    """What a section that has several kinds may be, those ``having`` a key or all; none of another section."""
+    tag = next((key for name, key, _ in _KINDS if name == section.replace("beside.", "training.")), None)
+    if tag is None:
+        return []
+    *way, last = section.replace("beside.", "training.").split(".")
     model: Any = WorkflowRecipe
     for name in way:
         model = model.model_fields[name].annotation
-    yield from (kind.model_fields[key].default for kind in _parts(model.model_fields[last].annotation))
+    kinds = _parts(model.model_fields[last].annotation)
+    return [kind.model_fields[tag].default for kind in kinds if (having or tag) in kind.model_fields]
 
 
-_MEMBERS = {*PART_KINDS, *(member for section, key, _ in _KINDS for member in _members(section, key))}
+_MEMBERS = {*PART_KINDS, *(member for section, _, _ in _KINDS for member in _members(section))}

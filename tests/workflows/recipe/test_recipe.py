@@ -79,6 +79,10 @@ def test_saved_and_read_again_it_is_the_same(tmp_path: Path) -> None:
         ),
         (["data.poses.sen=5"], r"unknown key 'data.poses.sen', .* \(data.poses has seen, unseen, distribution, seed\)"),
         (["training.network.name=npt", "training.network.witdh=5"], r"\(training.network has name, variant.*\)\. All"),
+        (
+            ["data.body={family: leg}", "data.body.phenotypes.age=[0,1]"],
+            r"'data.body.phenotypes' is a key of anny, not of the one chosen \(data.body has family, rings, ",
+        ),
         (["training.batch=many"], r"training.batch: .*integer.*\(given: 'many'\)"),
         (["training.batch=0"], r"training.batch: .*greater than or equal to 1 \(given: 0\)"),
         (["training.batch=9"], r"batch 9 cannot be shared equally by 2 ranks"),
@@ -104,7 +108,7 @@ def test_a_network_is_chosen_by_name_and_the_keys_of_another_do_not_stay() -> No
     with pytest.raises(RecipeError, match=r"training.network: .*'nptt'.*'dsffnet', 'npt'"):
         load_recipe("dsffnet-small", ["training.network.name=nptt"])
     with pytest.raises(
-        RecipeError, match=r"'training.network.decoder_widths' is a key of another kind of 'training.net"
+        RecipeError, match=r"'training.network.decoder_widths' is a key of dsffnet, not of the one chosen \(tr"
     ):
         load_recipe("dsffnet-small", ["training.network.name=npt", "training.network.decoder_widths=[8,8,8]"])
 
