@@ -33,8 +33,9 @@ def transfer(
     ----------
     source, target
         The mesh in the wanted pose and the mesh of the wanted identity, each a path (OBJ, PLY, GLB, OFF, STL), an
-        object with ``vertices`` and ``faces`` such as a ``trimesh.Trimesh``, or a pair (vertices [n, 3], triangles
-        [f, 3]). They may differ in vertices, faces, size and place, and are not changed.
+        object with ``vertices`` and ``faces`` such as a ``trimesh.Trimesh``, a ``trimesh.Scene`` whose geometries make
+        one body, or a pair (vertices [n, 3], triangles [f, 3]). They may differ in vertices, faces, size and place, and
+        are not changed.
     model
         A run folder, weights, ``models:/NAME@ALIAS`` (of the server MLFLOW_TRACKING_URI), or the name of weights that
         come along; by default those of people or of animals, by the meshes.

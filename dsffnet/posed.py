@@ -2,6 +2,9 @@
 
 import argparse
 import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import MeshError, RecipeError
+from datagen.common.errors import DsffnetError, MeshError, RecipeError
 from datagen.mesh.files import MeshFile, read_mesh_file, write_posed
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Alone, Encoded, Surface
+from datagen.mesh.geometries import CHOOSE, require_one_body
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
 from training.inference.orientation import axes_of_both
@@ -40,9 +44,10 @@ class PosedMesh:
             The place is one of the meshes that were read, of an unknown format, or cannot be written.
         """
         job = replace(self.job, out=Path(path))
-        job.check_places()
-        for line in write_posed(self.target, self.vertices, job.out):
-            warn(line)
+        with _in_words_of_python():
+            job.check_places()
+            for line in write_posed(self.target, self.vertices, job.out).left_out:
+                warn(line)
 
 
 @dataclass(frozen=True)
@@ -67,10 +72,22 @@ class Options:
 
 def posed(source: Any, target: Any, options: Options) -> PosedMesh:
     """Return the target in the pose of the source, by the work of ``dsffnet transfer``."""
+    with _in_words_of_python():
+        return _posed(source, target, options)
+
+
+def _posed(source: Any, target: Any, options: Options) -> PosedMesh:
     read = [_mesh_file(given, role) for given, role in ((source, "source"), (target, "target"))]
     job = _job(read, options)
     with weights_of(options.weights) as weights:
-        work = TransferWork.of(job, weights, first=read[0].mesh, target=read[1], force=options.force)
+        work = TransferWork.of(
+            job,
+            weights,
+            first=read[0].mesh,
+            target=read[1],
+            force=options.force,
+            warn=lambda line: warn(_of_python(line)),
+        )
         found = work.transfer(
             source=read[0].mesh,
             target=read[1].mesh,
@@ -79,6 +96,35 @@ def posed(source: Any, target: Any, options: Options) -> PosedMesh:
             refine=REFINE_WEIGHT if options.refine else 0.0,
         )
     return PosedMesh(np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64), job, read[1])
+
+
+_OF_PYTHON = {
+    f"Choose with {CHOOSE}": "Give the one that is the body by itself",
+    "choose it by --source-geometry or --target-geometry, or save it by itself": "give it by itself",
+    "look at --picture": "look at it",
+    "choose another --out": "choose another path",
+    "add --tracking-uri URI, or set": "set",
+    "check --tracking-uri": "check MLFLOW_TRACKING_URI",
+}
+"""What messages say that a command line is to do, and what is done here."""
+
+
+@contextmanager
+def _in_words_of_python() -> Iterator[None]:
+    """Errors of the command as a caller of the function understands them."""
+    try:
+        yield
+    except DsffnetError as error:
+        error.args = (_of_python(str(error)),)
+        raise
+
+
+def _of_python(message: str) -> str:
+    """A message in which options are arguments: ``--up=Z`` is ``up='Z'``, ``add --force`` is ``add force=True``."""
+    for words, ours in _OF_PYTHON.items():
+        message = message.replace(words, ours)
+    message = re.sub(r"--up=([^\s:]+) --front=([^\s:]+)", r"up='\1', front='\2'", message)
+    return re.sub(r"(?<!\S)--([a-z]+)", r"\1", re.sub(r"\badd --([a-z]+)", r"add \1=True", message))
 
 
 def _job(read: list[MeshFile], options: Options) -> TransferJob:
@@ -110,6 +156,8 @@ def _mesh_file(given: Any, role: str) -> MeshFile:
 
 
 def _mesh(given: Any, role: str) -> Mesh:
+    if hasattr(given, "graph") and hasattr(given, "geometry"):
+        return _whole(given, role)
     try:
         both = (given.vertices, given.faces) if hasattr(given, "vertices") else given
         vertices, faces = (np.array(each) for each in both)
@@ -123,6 +171,29 @@ def _mesh(given: Any, role: str) -> Mesh:
             wanted = "whole numbers" if what == "faces" else "real numbers"
             raise MeshError(f"{role}: its {what} are {array.dtype}, not {wanted}")
     return Mesh(vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False))
+
+
+def _whole(scene: Any, role: str) -> Mesh:
+    """All that a trimesh.Scene shows and has triangles, where it stands, as one mesh.
+
+    Raises
+    ------
+    MeshError
+        There is none, or they do not make one body.
+    """
+    placed, corners = dict[str, NDArray[np.float64]](), list[NDArray[np.int64]]()
+    for node in scene.graph.nodes_geometry:
+        place, name = scene.graph[node]
+        vertices, faces = (np.asarray(getattr(scene.geometry[name], what, ())) for what in ("vertices", "faces"))
+        if not len(faces):
+            continue
+        is_mirrored = np.linalg.det(place[:3, :3]) < 0
+        corners.append((faces[:, ::-1] if is_mirrored else faces) + sum(map(len, placed.values())))
+        placed[str(node)] = vertices @ place[:3, :3].T + place[:3, 3]
+    if not placed:
+        raise MeshError(f"{role} is a scene that shows no triangles; give one that holds the body")
+    require_one_body({name: np.array([its.min(axis=0), its.max(axis=0)]) for name, its in placed.items()}, Path(role))
+    return Mesh(np.concatenate(list(placed.values())), np.concatenate(corners))
 
 
 class _InMemory(Alone):

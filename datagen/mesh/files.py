@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,17 +155,19 @@ def usable(original: MeshFile, vertices: NDArray[np.floating]) -> NDArray[np.flo
     return found
 
 
-def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *, beside: bool = True) -> list[str]:
+class Written(NamedTuple):
+    """Files that were written, the mesh last, and what was left out because it has no place there; one line each."""
+
+    files: list[Path]
+    left_out: list[str]
+
+
+def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *, beside: bool = True) -> Written:
     """Write the original with other vertices [n, 3]; the file appears whole or not at all. The suffix tells the format.
 
     Normals are made anew where the file has them. Materials and textures are copied beside an OBJ or PLY file that goes
     to another folder; a different file of that name is left alone, unless it is called after ``out``. With ``beside``
     False nothing is written but the file.
-
-    Returns
-    -------
-    list of str
-        What was left out because the format cannot hold it, or was not to be had; one line each.
 
     Raises
     ------
@@ -177,10 +179,14 @@ def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *
     out = Path(out)
     require_known(out)
     made = _encoded(original, usable(original, vertices), out)
+    files, left_out = list[Path](), list(made.left_out)
     for name, content in made.beside.items() if beside else ():
-        made.left_out.extend(_write_beside(out, name, content))
+        if _write_beside(out, name, content):
+            files.append(out.parent / name)
+        else:
+            left_out.append(f"{name}: another file of that name is in {out.parent} and was left as it is")
     write_atomically(out, made.content)
-    return list(dict.fromkeys(made.left_out))
+    return Written([*files, out], list(dict.fromkeys(left_out)))
 
 
 def _encoded(original: MeshFile, vertices: NDArray[np.float64], out: Path) -> Encoded:
@@ -197,15 +203,16 @@ def _folder(path: Path) -> Path:
     return path.parent.resolve()
 
 
-def _write_beside(out: Path, name: str, content: bytes) -> list[str]:
+def _write_beside(out: Path, name: str, content: bytes) -> bool:
+    """Whether the content stands there now; a different file of that name is left alone."""
     place = out.parent / name
     if place.is_file() and place.stat().st_size == len(content) and place.read_bytes() == content:
-        return []
+        return True
     called_after = re.fullmatch(rf"({re.escape(out.stem)}|{re.escape(one_word(out.stem))})(-\d+)?\.\w+", name)
     if place.exists() and not called_after:
-        return [f"{name}: another file of that name is in {out.parent} and was left as it is"]
+        return False
     write_atomically(place, content)
-    return []
+    return True
 
 
 def draft_of(original: MeshFile) -> "Draft":

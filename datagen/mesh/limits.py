@@ -1,5 +1,7 @@
 """What is refused: files that are too large, before they are read whole, and shapes that cannot be posed."""
 
+import contextlib
+import difflib
 import json
 import os
 import struct
@@ -154,8 +156,11 @@ def require_file(path: Path) -> None:
     if os.path.isdir(path):
         raise MeshError(f"{path} is a folder; name a mesh file in it")
     if not os.path.isfile(path):  # Path's own raises on names that are too long
-        raise MeshError(f"{path} is not a regular file" if os.path.exists(path) else f"no mesh file at {path}")
-    require_known(path)
+        if os.path.exists(path):
+            raise MeshError(f"{path} is not a regular file")
+        raise MeshError(f"no mesh file at {path}{_nearest_beside(path)}")
+    if path.suffix.lower() not in FORMATS:
+        raise MeshError(f"{_unknown_format(path)}. Export it as GLB (in Blender: File > Export > glTF 2.0)")
     if path.stat().st_size == 0:
         raise MeshError(f"{path} is empty (0 bytes): export or copy it again")
 
@@ -163,7 +168,20 @@ def require_file(path: Path) -> None:
 def require_known(path: Path) -> None:
     """Refuse a suffix of no known format (MeshError)."""
     if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}")
+        raise MeshError(_unknown_format(path))
+
+
+def _unknown_format(path: Path) -> str:
+    return f"{path}: unknown mesh format {path.suffix!r}; known are {', '.join(FORMATS)}"
+
+
+def _nearest_beside(path: Path) -> str:
+    """Words that suggest the mesh file of the folder whose name is nearest, or none."""
+    names = dict[str, Path]()
+    with contextlib.suppress(OSError, ValueError):
+        names = {each.stem: each for each in path.parent.iterdir() if each.suffix.lower() in FORMATS}
+    close = difflib.get_close_matches(path.stem, names, n=1)
+    return f", did you mean {names[close[0]]}?" if close else ""
 
 
 def require_thickness(vertices: NDArray[np.float64], path: Path) -> None:

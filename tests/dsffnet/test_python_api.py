@@ -13,6 +13,7 @@ from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from dsffnet import DsffnetError, transfer
+from dsffnet.posed import _of_python
 from tests.support.commands import ROOT
 from tests.support.recipes import tiny_training
 from training.engine.trainer import train
@@ -87,6 +88,52 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
         transfer(pose, pose, model=run, align=True, up="Z")
     with pytest.raises(DsffnetError, match="never written over"):
         transfer(pose, pose, model=run).export(pose)
+
+
+def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    pose, said = run.parent / "pose.ply", list[str]()
+    good = load_mesh(pose)
+    apart = trimesh.Scene({str(x): trimesh.Trimesh(good.vertices + x, good.faces, process=False) for x in (0, 9)})
+    apart.export(tmp_path / "apart.glb")
+    for given, options in (
+        (pose, {"up": "X,Y,Z"}),
+        (pose, {"model": "no-run"}),
+        (pose, {"model": "models:/dsffnet@best"}),
+        (pose, {"model": run, "force": True}),
+        (apart, {"model": run}),
+        (tmp_path / "apart.glb", {"model": run}),
+    ):
+        with pytest.raises(DsffnetError) as error:
+            transfer(pose, given, **options)
+        said.append(str(error.value))
+    with pytest.raises(DsffnetError) as error:
+        transfer(pose, pose, model=run).export(pose)
+    said.append(str(error.value))
+    assert "--" not in " ".join(said) and len(set(said)) == 7
+    assert said[0] == "up='X,Y,Z', front='Z': name one axis, or two with a comma, of source and target"
+    assert said[2].endswith("set MLFLOW_TRACKING_URI") and said[4].startswith("target holds 2 geometries")
+    assert said[-1].endswith("choose another path")
+    advice = "add --align, or --up=Z,Y --front=-Y,Z: or add --force; look at --picture"
+    assert _of_python(advice) == "add align=True, or up='Z,Y', front='-Y,Z': or add force=True; look at it"
+
+
+def test_a_scene_is_posed_as_one_body(run: Path) -> None:
+    person = load_mesh(run.parent / "person.ply")
+    body, scene = trimesh.Trimesh(person.vertices, person.faces, process=False), trimesh.Scene()
+    turn = trimesh.transformations.rotation_matrix(0.3, [0, 1, 0])
+    scene.add_geometry(body.copy().apply_transform(np.linalg.inv(turn)), node_name="body", transform=turn)
+    scene.add_geometry(trimesh.creation.icosphere(1, radius=0.05), node_name="hat")
+    scene.add_geometry(trimesh.points.PointCloud(np.eye(3)), node_name="marks")
+    posed = transfer(run.parent / "pose.ply", scene, model=run)
+    assert len(posed.vertices) == len(person.vertices) + 42 and np.array_equal(
+        posed.faces[: len(person.faces)], person.faces
+    )
+    alone = trimesh.Scene({"body": body})
+    expected = transfer(run.parent / "pose.ply", run.parent / "person.ply", model=run)
+    assert np.allclose(transfer(run.parent / "pose.ply", alone, model=run).vertices, expected.vertices, atol=1e-6)
+    with pytest.raises(DsffnetError, match="source is a scene that shows no triangles"):
+        transfer(trimesh.Scene(), scene, model=run)
 
 
 def test_importing_it_brings_no_heavy_package() -> None:

@@ -33,7 +33,7 @@ class View(Protocol):
         """A frame is done."""
 
     def fail(self, message: str) -> None:
-        """A transfer, or an upload, cannot be."""
+        """A transfer cannot be, and there is no result."""
 
 
 class Result(NamedTuple):
@@ -104,11 +104,11 @@ class Session:
         Raises
         ------
         MeshError
-            Nothing is posed yet.
+            Nothing is posed: not yet, or it was refused.
         """
         outcome = self.outcome
         if outcome is None:
-            raise MeshError("nothing is posed yet: choose a source and a target")
+            raise MeshError("nothing is posed: choose a source and a target that can be")
         with self._here:
             self._require_open()
             with tempfile.TemporaryDirectory(dir=self.folder) as folder:
@@ -131,6 +131,7 @@ class Session:
         try:
             self._transfers.run(asked, self.folder, stale, self._take)
         except Exception as error:
+            self.outcome = None  # what was posed before is not of the meshes that are chosen now
             self._view.fail(plain(reason_of_failure(error), self.folder))
 
     def _take(self, outcome: Outcome) -> None:
@@ -144,7 +145,7 @@ def _written(outcome: Outcome, out: Path) -> list[str]:
     if len(frames) > 1 and out.suffix == ".glb":
         write_animation(outcome.file, frames, out, frames_per_second=outcome.asked.switches.fps)
         return []
-    return write_posed(outcome.file, frames[-1], out)
+    return write_posed(outcome.file, frames[-1], out).left_out
 
 
 def _file_or_zip(out: Path) -> tuple[str, bytes]:

@@ -60,6 +60,7 @@ class TransferWork:
         self.by, self._warn = by, warn
         self._shown: dict[int, Mesh] = {}
         self._played: dict[int, Mesh] = {}
+        self._beside: list[Path] = []
 
     @classmethod
     def of(
@@ -123,11 +124,13 @@ class TransferWork:
                 self._warn(line)
 
     def run(self) -> str:
-        """Write everything; what was done, in a line."""
+        """Write everything; what was done, and which files were written beside the output, in a line."""
         done = self._write_sequence() if self.job.is_sequence else self._write_pair()
         if self.job.drawn:
             self._draw()
-        return f"{done}, by the weights {self.by}" if self.by else done
+        by = f", by the weights {self.by}" if self.by else ""
+        beside = ", ".join(map(str, [*self._beside, *self.job.drawn]))
+        return f"{done}{by}{beside and f'; beside it {beside}'}"
 
     def _votes(self) -> list[NDArray[np.floating]]:
         count = self.job.count
@@ -139,7 +142,7 @@ class TransferWork:
 
     def _write_pair(self) -> str:
         job, posed = self.job, next(self._kept())
-        self._write_posed(posed, job.out)
+        *self._beside, _ = self._write_posed(posed, job.out)
         return f"{job.out}: {len(posed.vertices):,} vertices of {job.target} in the pose of {job.sources[0]}"
 
     def _write_sequence(self) -> str:
@@ -170,10 +173,11 @@ class TransferWork:
             self._write_posed(posed, place, beside=not number)  # what lies beside the first lies beside all
             yield posed
 
-    def _write_posed(self, posed: Mesh, out: Path, *, beside: bool = True) -> None:
-        lost = write_posed(self.target, posed.vertices, out, beside=beside)
-        if lost and beside:
-            warn(f"{out.name} does not keep: {'; '.join(lost)}")
+    def _write_posed(self, posed: Mesh, out: Path, *, beside: bool = True) -> list[Path]:
+        written = write_posed(self.target, posed.vertices, out, beside=beside)
+        if written.left_out and beside:
+            warn(f"{out.name} does not keep: {'; '.join(written.left_out)}")
+        return written.files
 
     def posed(self) -> Iterator[Mesh]:
         """The target in the pose of every source, one after the other."""

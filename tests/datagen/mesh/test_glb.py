@@ -27,7 +27,7 @@ def test_vertices_are_those_of_the_world_and_come_back_through_the_nodes(tmp_pat
     expected = (POINTS * (2, 2, -2))[:, [1, 0, 2]] * (-1, 1, 1) + (10, 0, 0)
     assert np.allclose(read.mesh.vertices, expected, atol=1e-6)
     moved = read.mesh.vertices * (1, 2, 3) + 1
-    assert write_posed(read, moved, tmp_path / "out.glb") == []
+    assert write_posed(read, moved, tmp_path / "out.glb").left_out == []
     again = read_mesh_file(tmp_path / "out.glb")
     assert np.allclose(again.mesh.vertices, moved, atol=1e-5) and np.array_equal(again.mesh.faces, MIRRORED)
     loaded = trimesh.load(tmp_path / "out.glb", process=False, force="mesh")
@@ -97,7 +97,7 @@ def test_skin_animation_and_morphs_are_applied_at_rest_then_dropped_and_named(tm
     read = read_mesh_file(saved(document, tmp_path))
     rest = POINTS + 0.25
     assert np.allclose(read.mesh.vertices, (rest + np.array([0, 4, 0])) / 2 + 3 * rest / 2, atol=1e-6)
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.glb")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.glb").left_out
     assert notes == ["skins", "animations", "morph targets"]
     again = read_mesh_file(tmp_path / "out.glb")
     assert np.allclose(again.mesh.vertices, read.mesh.vertices, atol=1e-5)
@@ -139,7 +139,7 @@ def test_geometries_that_make_one_body_are_one_mesh_and_come_back_whole(tmp_path
     shown = trimesh.load(path, process=False, force="mesh")  # another reader's idea of the same scene
     assert np.allclose(*(np.unique(each.round(4), axis=0) for each in (read.mesh.vertices, shown.vertices)))
     moved = read.mesh.vertices * (1, 2, 3) + 1
-    assert write_posed(read, moved, tmp_path / "out.glb") == ["other geometries: elsewhere, hidden"]
+    assert write_posed(read, moved, tmp_path / "out.glb").left_out == ["other geometries: elsewhere, hidden"]
     after, before = sound(tmp_path / "out.glb"), Gltf(path).json
     assert [node | {"mesh": 0} for node in after["nodes"][:5]] == [node | {"mesh": 0} for node in before["nodes"][:5]]
     assert [mesh.get("name") for mesh in after["meshes"]] == [None, "eye", "eye", "hat"]
@@ -198,7 +198,7 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
     assert geometry_names(path) == ("body", "other")
     read = read_mesh_file(path, geometries=["other"])
     assert len(read.mesh.faces) == 12 and read.name == "other"
-    assert write_posed(read, read.mesh.vertices, tmp_path / "box.glb") == ["other geometries: body"]
+    assert write_posed(read, read.mesh.vertices, tmp_path / "box.glb").left_out == ["other geometries: body"]
     assert read_mesh_file(tmp_path / "box.glb").name == "other"
     assert read_mesh_file(path, geometries=["other", "body"]).geometries == ("body", "other")  # in the file's order
     assert read_mesh_file(two(tmp_path, (1.6, 0, 0), trimesh.creation.box())).geometries == ("body", "other")
@@ -258,5 +258,5 @@ def test_a_face_that_names_no_vertex(tmp_path: Path) -> None:
 
 def test_properties_of_materials_that_an_obj_cannot_hold_are_named(tmp_path: Path) -> None:
     read = read_mesh_file(saved(scene(), tmp_path))
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.obj")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "out.obj").left_out
     assert notes == ["material properties beyond base colour and its texture"]

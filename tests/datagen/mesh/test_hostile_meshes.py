@@ -133,7 +133,7 @@ def test_a_library_that_is_no_file_is_noted_and_the_mesh_is_written(tmp_path: Pa
     elif kind == "link to itself":
         place.symlink_to("look.mtl")
     read = read_mesh_file(mesh)
-    (note,) = write_posed(read, read.mesh.vertices, tmp_path / "out" / "posed.obj")
+    (note,) = write_posed(read, read.mesh.vertices, tmp_path / "out" / "posed.obj").left_out
     assert note.startswith("materials: ") and [p.name for p in (tmp_path / "out").iterdir()] == ["posed.obj"]
 
 

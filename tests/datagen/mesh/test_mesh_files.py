@@ -60,7 +60,7 @@ def test_any_triangles_come_back_as_they_were(tmp_path_factory: pytest.TempPathF
 
 def test_obj_to_glb_keeps_uvs_materials_texture_colours_and_says_what_changes(tmp_path: Path) -> None:
     read = read_mesh_file(golden("cube.obj", tmp_path))
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.glb")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.glb").left_out
     assert "quads: written as triangles" in notes and "groups" in notes and "smoothing groups" in notes
     assert any(note.startswith("seams: 16 vertices") for note in notes)  # three sides meet in each of eight corners
     again = read_mesh_file(tmp_path / "cube.glb")
@@ -80,7 +80,7 @@ def test_glb_to_obj_and_back_keeps_uvs_materials_and_texture(tmp_path: Path) -> 
     original = read_mesh_file(golden("cube.obj", tmp_path))
     write_posed(original, original.mesh.vertices, tmp_path / "cube.glb")
     read = read_mesh_file(tmp_path / "cube.glb")
-    assert write_posed(read, read.mesh.vertices, tmp_path / "new" / "cube.obj") == []
+    assert write_posed(read, read.mesh.vertices, tmp_path / "new" / "cube.obj").left_out == []
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["cube-0.png", "cube.mtl", "cube.obj"]
     again = read_mesh_file(tmp_path / "new" / "cube.obj").content.surface
     before = read.content.surface
@@ -93,14 +93,24 @@ def test_glb_to_obj_and_back_keeps_uvs_materials_and_texture(tmp_path: Path) -> 
 
 def test_what_off_and_stl_cannot_hold_is_named(tmp_path: Path) -> None:
     read = read_mesh_file(golden("cube.obj", tmp_path))
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.stl")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.stl").left_out
     assert {"texture coordinates", "materials", "colours", "quads: written as triangles"} <= set(notes)
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.off")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "cube.off").left_out
     assert {"texture coordinates", "materials"} <= set(notes) and "quads: written as triangles" not in notes
     assert b"\n4 3 2 1 0\n" in (tmp_path / "cube.off").read_bytes()
 
 
 def test_missing_files_and_folders_as_files(tmp_path: Path) -> None:
+    saved(tmp_path, ".obj")
+    for name in ("mes.obj", "mesh.ply"):
+        with pytest.raises(MeshError, match=rf"no mesh file at .*/{name}, did you mean .*/mesh\.obj\?"):
+            read_mesh_file(tmp_path / name)
+    for name in ("a.obj", "no/where/mesh.obj"):
+        with pytest.raises(MeshError, match=rf"no mesh file at .*{name}$"):
+            read_mesh_file(tmp_path / name)
+    (tmp_path / "hero.fbx").write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(MeshError, match=r"'\.fbx'; known are .* Export it as GLB \(in Blender: File > Export > glTF"):
+        read_mesh_file(tmp_path / "hero.fbx")
     with pytest.raises(MeshError, match="no mesh file at"):
         read_mesh_file(tmp_path / "none.obj")
     with pytest.raises(MeshError, match="is a folder"):
@@ -200,5 +210,5 @@ def test_a_file_of_another_whose_name_only_begins_alike_is_left_alone(tmp_path: 
     (tmp_path / "from" / "person.obj").write_text("mtllib person.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
     (tmp_path / "person.mtl").write_text("of another body")
     read = read_mesh_file(tmp_path / "from" / "person.obj")
-    (said,) = write_posed(read, read.mesh.vertices, tmp_path / "p.obj")
+    (said,) = write_posed(read, read.mesh.vertices, tmp_path / "p.obj").left_out
     assert said.startswith("person.mtl: another file") and (tmp_path / "person.mtl").read_text() == "of another body"

@@ -23,7 +23,7 @@ def lines_of(content: bytes, *starts: bytes) -> list[bytes]:
 def test_all_but_positions_and_normals_stays_as_it_is(tmp_path: Path) -> None:
     read = read_mesh_file(golden("cube.obj", tmp_path))
     moved = read.mesh.vertices * (1, 2, 3) + 0.123456789
-    assert write_posed(read, moved, tmp_path / "posed.obj") == []
+    assert write_posed(read, moved, tmp_path / "posed.obj").left_out == []
     written = (tmp_path / "posed.obj").read_bytes()
     kept = (b"#", b"mtllib", b"o", b"vt", b"g", b"usemtl", b"s")
     assert lines_of(written, *kept) == lines_of(CUBE, *kept)
@@ -83,11 +83,11 @@ def test_line_ends_of_other_systems_stay(tmp_path: Path, ending: bytes) -> None:
 
 def test_materials_and_textures_go_along_to_another_folder_and_spare_what_is_there(tmp_path: Path) -> None:
     read = read_mesh_file(golden("cube.obj", tmp_path / "mine"))
-    assert write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj") == []
+    assert write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj").left_out == []
     assert (tmp_path / "other" / "look.mtl").read_bytes() == LOOK
     assert (tmp_path / "other" / "skin of me.png").read_bytes() == PNG
     (tmp_path / "other" / "look.mtl").write_bytes(b"newmtl anothers\n")
-    assert "look.mtl" in write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj")[0]
+    assert "look.mtl" in write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj").left_out[0]
     assert (tmp_path / "other" / "look.mtl").read_bytes() == b"newmtl anothers\n"
 
 
@@ -98,7 +98,7 @@ def test_materials_in_a_folder_below_and_those_that_are_not_there(tmp_path: Path
     (tmp_path / "mine" / "m" / "skin of me.png").write_bytes(PNG)
     path.write_bytes(CUBE.replace(b"look.mtl", b"m/look.mtl ../up.mtl gone.mtl"))
     read = read_mesh_file(path)
-    notes = write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj")
+    notes = write_posed(read, read.mesh.vertices, tmp_path / "other" / "posed.obj").left_out
     assert (tmp_path / "other" / "m" / "skin of me.png").read_bytes() == PNG
     assert len(notes) == 2 and "gone.mtl is not beside" in notes[1]
     assert "../up.mtl was not copied: it lies outside of the mesh's folder" in notes[0]
@@ -199,7 +199,7 @@ def test_groups_and_objects_are_chosen_with_what_they_need(tmp_path: Path, line_
     assert [each.name for each in hat.content.surface.materials] == ["cloth"] and hat.name == "tall hat"
     assert hat.content.surface.uvs is not None
     assert hat.content.surface.uvs[3:6].tolist() == [[0.25, 0.75], [1, 0], [0, 0]]
-    left_out = write_posed(hat, hat.mesh.vertices * 2, tmp_path / "hat.obj")
+    left_out = write_posed(hat, hat.mesh.vertices * 2, tmp_path / "hat.obj").left_out
     assert left_out == ["other objects and groups: body, torso, all, legs"]
     assert lines_of((tmp_path / "hat.obj").read_bytes(), b"o", b"g", b"l") == [b"o tall hat", b"g brim"]
     assert np.allclose(read_mesh_file(tmp_path / "hat.obj").mesh.vertices, hat.mesh.vertices * 2)

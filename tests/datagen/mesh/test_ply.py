@@ -18,7 +18,7 @@ def test_all_but_positions_and_normals_of_a_ply_file_stays(tmp_path: Path, name:
     content = golden(name, tmp_path).read_bytes()
     read = read_mesh_file(tmp_path / name)
     moved = POINTS * (1, 2, 4) + 0.125
-    assert write_posed(read, moved, tmp_path / "new" / "b.ply") == []
+    assert write_posed(read, moved, tmp_path / "new" / "b.ply").left_out == []
     written = (tmp_path / "new" / "b.ply").read_bytes()
     assert (tmp_path / "new" / "skin of me.png").read_bytes() == PNG
     again = read_mesh_file(tmp_path / "new" / "b.ply")
@@ -65,12 +65,12 @@ def test_texture_coordinates_of_corners_and_colours_reach_other_formats(tmp_path
 def test_colours_quads_comments_and_normals_of_an_off_file(tmp_path: Path) -> None:
     read = read_mesh_file(GOLDEN / "rich.off")
     faces = (GOLDEN / "rich.off").read_text().splitlines()[-3:]
-    assert write_posed(read, POINTS * (1, 1, -1), tmp_path / "b.off") == []
+    assert write_posed(read, POINTS * (1, 1, -1), tmp_path / "b.off").left_out == []
     written = (tmp_path / "b.off").read_text().splitlines()
     assert written[:3] == ["CNOFF", "# mine", "5 3 0"] and written[-3:] == faces
     assert all(line.endswith(" 10 20 30 255") for line in written[3:8])
     assert written[6].split()[3:6] == ["0", "0", "-1"]  # a corner of the base alone; the file said 1 0 0
-    assert "face colours" in write_posed(read, POINTS, tmp_path / "b.ply")
+    assert "face colours" in write_posed(read, POINTS, tmp_path / "b.ply").left_out
 
 
 def test_counts_on_the_first_line_of_an_off_file(tmp_path: Path) -> None:

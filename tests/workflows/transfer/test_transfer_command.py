@@ -64,8 +64,11 @@ def files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def test_a_pair_with_picture_and_page(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+def test_a_pair_with_picture_and_page(
+    transfer: Transfer, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     transfer("pose.obj", "person.obj", "-o", tmp_path / "posed.obj", "--picture", "--viewer")
+    assert capsys.readouterr().out.endswith(f"; beside it {tmp_path}/posed.png, {tmp_path}/posed.html\n")
     assert files(tmp_path) == ["posed.html", "posed.obj", "posed.png"]
     source, target = load_mesh("pose.obj"), load_mesh("person.obj")
     expected = PoseTransfer.from_run(run)(source=source, target=target)
@@ -198,6 +201,17 @@ def test_frames_take_the_place_of_earlier_ones_but_not_of_other_files(
         assert (out / "person.mtl").read_text() == "of another body"
         assert "person.mtl: another file of that name" in capsys.readouterr().err
         assert load_mesh(out / "frame_1.obj") and (out / "textures" / "skin.png").read_bytes() == b"a texture"
+
+
+def test_materials_that_are_written_beside_are_named(
+    transfer: Transfer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "skin").mkdir()
+    (tmp_path / "skin" / "person.mtl").write_text("newmtl skin\n")
+    (tmp_path / "skin" / "person.obj").write_text("mtllib person.mtl\n" + Path("person.obj").read_text())
+    transfer("pose.obj", tmp_path / "skin" / "person.obj", "-o", tmp_path / "posed.obj")
+    assert files(tmp_path) == ["person.mtl", "posed.obj", "skin", "skin/person.mtl", "skin/person.obj"]
+    assert capsys.readouterr().out.endswith(f"; beside it {tmp_path}/person.mtl\n")
 
 
 def test_a_pattern_becomes_one_animated_file(transfer: Transfer, tmp_path: Path) -> None:
