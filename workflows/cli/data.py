@@ -89,8 +89,10 @@ def declare_stand_in(made: Parser) -> None:
     from datagen.bodies.standins.smpl_format import StandInKind
     from datagen.recipe import AnnyTopology
 
-    made.add_argument("kind", choices=get_args(StandInKind), help="whose layout")
-    made.add_argument("--out", required=True, metavar="X.npz", help="where it goes")
+    made.add_argument(
+        "kind", choices=(*get_args(StandInKind), "animals"), help="whose layout; or the twelve CC0 animals"
+    )
+    made.add_argument("--out", required=True, metavar="X.npz", help="where it goes; of animals a folder")
     made.add_argument(
         "--topology",
         default="notoes_collapse10pc",
@@ -292,18 +294,34 @@ def convert_body_command(options: argparse.Namespace) -> None:
 
 
 def stand_in_command(options: argparse.Namespace) -> None:
-    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, to try things out.
+    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, or CC0 animals, to try things out.
 
     examples:
       dsffnet stand-in smpl --out standin.npz
       dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr
+      dsffnet stand-in animals --out animals
     """
+    if options.kind == "animals":
+        _write_animals(Path(options.out))
+        return
     from datagen.bodies.standins.smpl_format import write_standin
 
     path = write_standin(options.kind, Path(options.out), topology=options.topology)
     family = "smal" if options.kind == "smal" else f"smpl data.body.model={options.kind}"
     print_text(
         f"written: {path}. It is not the licensed model. Use it: --set data.body.family={family} data.body.path={path}"
+    )
+
+
+def _write_animals(folder: Path) -> None:
+    from datagen.characters.cc0_animals import are_there, write_animals
+
+    if not are_there():
+        print_text("fetching the animals, 14 MB, once ...")
+    files = write_animals(folder)
+    print_text(
+        f"written: {len(files)} animals (GLB, CC0) in {folder}. Pose one like another: "
+        f"dsffnet transfer {folder / 'deer.glb'} {folder / 'fox.glb'} -o posed.glb"
     )
 
 
@@ -329,11 +347,11 @@ def _show(url: str) -> None:
 
 COMMANDS = (
     Command(generate_command, declare_generate, takes_recipe=True),
-    Command(append_command, declare_append),
     Command(inspect_command, declare_inspect),
+    Command(append_command, declare_append),
     Command(verify_command, declare_verify),
-    Command(import_command, declare_import),
     Command(export_command, declare_export),
+    Command(import_command, declare_import),
     Command(convert_body_command, declare_convert),
     Command(stand_in_command, declare_stand_in),
 )

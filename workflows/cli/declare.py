@@ -27,12 +27,16 @@ class Command:
         """The word that a person types."""
         return self.run.__name__.removesuffix("_command").replace("_", "-")
 
+    @property
+    def summary(self) -> str:
+        """What it does, in a line."""
+        return (inspect.getdoc(self.run) or "").split("\n")[0]
+
     def add_to(self, commands: "argparse._SubParsersAction[Parser]", words: Sequence[str] | None) -> None:
         """Declare the subcommand; with the words that follow it, if it is the one, its options and all of its help."""
         text = inspect.getdoc(self.run) or ""
         made = commands.add_parser(
             self.name,
-            help=text.split("\n")[0],
             description=text,
             epilog=recipe_keys(words) if words is not None and self.takes_recipe else None,
             formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -4,15 +4,20 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from itertools import chain
 
 from workflows.cli import avatar, data, demo, runs, skin, studies, submit, transfer, ui
 from workflows.pipeline.console import guarded
 
 _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
-_COMMANDS = (
-    *data.COMMANDS, *runs.COMMANDS, *studies.COMMANDS, transfer.COMMAND, skin.COMMAND, avatar.COMMAND,
-    demo.COMMAND, submit.COMMAND, ui.COMMAND,
-)  # fmt: skip
+_GROUPS = {
+    "pose meshes": (transfer.COMMAND, demo.COMMAND, skin.COMMAND),
+    "make data": data.COMMANDS,
+    "train, measure, look": (*runs.COMMANDS, ui.COMMAND, submit.COMMAND),
+    "compare, vary, disturb": studies.COMMANDS,
+    "people in clothes": (avatar.COMMAND,),
+}
+"""In the order in which somebody new needs them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -30,13 +35,25 @@ def parsed(words: Sequence[str]) -> argparse.Namespace:
     """The options of a command line; ``command`` is the function that does what they ask for."""
     made = argparse.ArgumentParser(
         prog="dsffnet",
-        description="3-D pose transfer: datasets, training, evaluation, and posing your own meshes.",
-        epilog="From nothing to a trained and evaluated model in one go: python workflows/full.py",
+        usage="%(prog)s [-h] COMMAND ...",
+        description="3-D pose transfer: posing your own meshes, datasets, training, evaluation.",
+        epilog=_listed(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands = made.add_subparsers(required=True, metavar="COMMAND")
-    for command in _COMMANDS:
+    commands = made.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog=made.prog)
+    for command in chain.from_iterable(_GROUPS.values()):
         command.add_to(commands, words=words[1:] if command.name in words[:1] else None)
     return made.parse_args(_with_axes_joined(words))
+
+
+def _listed() -> str:
+    """The commands with what each does, by what somebody wants."""
+    lines = list[str]()
+    for group, commands in _GROUPS.items():
+        lines += [f"{group}:", *(f"  {command.name:16}{command.summary}" for command in commands), ""]
+    return "\n".join(
+        [*lines, "dsffnet COMMAND --help: options and examples", "all stages in one go: python workflows/full.py"]
+    )
 
 
 def _with_axes_joined(words: Sequence[str]) -> list[str]:

@@ -26,8 +26,8 @@ DETAILS: dict[str, AnnyTopology] = {
     "13,718 vertices": "anny",
 }
 ANIMALS_MISSING = (
-    "Animals need files that are fetched once: `python -c 'from datagen.characters.cc0_animals import animal_files; "
-    "animal_files()'`, then start the page again (docs/bodies/rigged.md)."
+    "Animals need files that are fetched once: `dsffnet stand-in animals --out animals`. Then load this page again "
+    "(docs/bodies/rigged.md)."
 )
 
 

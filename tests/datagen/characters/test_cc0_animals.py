@@ -60,6 +60,15 @@ def test_fetched_once_and_only_the_animals(index: Index, cache: Path, tmp_path: 
     assert [each.name for each in cache.iterdir() if each.is_dir()] == [folder.name], "nothing is left lying about"
 
 
+def test_copies_are_written_into_a_folder(index: Index, tmp_path: Path) -> None:
+    for _ in range(2):
+        written = animals.write_animals(tmp_path / "mine")
+        assert [each.read_text() for each in written] == [*animals.NAMES] and index.asked == 1
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="Choose another --out"):
+        animals.write_animals(tmp_path / "file")
+
+
 def test_workers_that_start_together_fetch_once(index: Index) -> None:
     workers = [threading.Thread(target=animals.animal_files) for _ in range(4)]
     for worker in workers:

@@ -38,7 +38,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 NAMES = (
     "generate", "append", "inspect", "verify", "import", "export", "convert-body", "stand-in", "train", "evaluate",
     "sync", "import-weights", "recipe", "sweep", "compare", "ablation", "robustness", "generalisation", "transfer",
-    "skin", "submit", "ui",
+    "skin", "submit", "ui", "demo",
 )  # fmt: skip
 
 
@@ -46,6 +46,15 @@ def test_every_subcommand_has_help_with_an_example() -> None:
     overview = command("--help").stdout.split()
     for name in NAMES:
         assert name in overview and f"dsffnet {name}" in command(name, "--help").stdout.partition("examples:")[2]
+
+
+def test_the_overview_begins_with_what_somebody_new_does_first() -> None:
+    overview = command("--help").stdout
+    places = [overview.index(f"\n  {name} ") for name in ("transfer", "demo", "generate", "train", "evaluate", "sweep")]
+    assert places == sorted(places) and overview.startswith("usage: dsffnet [-h] COMMAND ...\n")
+    assert command("transfer", "--help").stdout.startswith("usage: dsffnet transfer [-h]")
+    for line in overview.splitlines():
+        assert len(line) <= 120
 
 
 def help_of(*words: str) -> str:

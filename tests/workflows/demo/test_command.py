@@ -9,6 +9,7 @@ import pytest
 
 from workflows.cli import main as cli
 from workflows.cli.demo import saying_what_it_does
+from workflows.demo.bodies import ANIMALS_MISSING
 
 
 def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,6 +28,11 @@ def test_weights_that_are_not_there_are_one_line(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit):
         cli.main(["demo", "--port", "0", "--model", "no-such-run"])
     assert "these come along: animals" in capsys.readouterr().err
+
+
+def test_animals_come_by_a_command_that_there_is() -> None:
+    command = ANIMALS_MISSING.split("`")[1].split()
+    assert command[0] == "dsffnet" and cli.parsed(command[1:]).kind == "animals"
 
 
 def test_other_commands_do_not_import_it() -> None:
