@@ -79,15 +79,23 @@ class Page:
         """Show the frame that is done; the others are played."""
         self._progress.visible = len(outcome.frames) < outcome.count
         self._progress.value = 100 * len(outcome.frames) / outcome.count
+        self._offer_downloads(True)
         if len(outcome.frames) == 1:
             self._draw(outcome, outcome.frames[0])
             self._stage.arrange()
         self._status.content = about(outcome, self.session.folder)
 
     def fail(self, message: str) -> None:
-        """Say what cannot be done; what is shown stays."""
-        self._stage.say("output")
+        """Say what cannot be posed; what was shown is of other meshes, and goes."""
+        with self._drawing, self._client.atomic():
+            self._stage.clear()
+            self._legend.content = ""
+        self._offer_downloads(False)
         self._progress.visible = False
+        self._refuse(message)
+
+    def _refuse(self, message: str) -> None:
+        """Say what is not taken."""
         self._status.content = f"**Not posed.** {message}"
         self._client.add_notification("That cannot be posed", message, color="red", auto_close_seconds=20)
 
@@ -114,19 +122,32 @@ class Page:
 
         return BodyControls(
             self._client.gui, first, keep, is_source=role == "source", keep_poses=self.session.keep_poses,
-            changed=self.ask, failed=lambda error: self.fail(plain(error, self.session.folder)),
+            changed=self.ask, failed=lambda error: self._refuse(plain(error, self.session.folder)),
         )  # fmt: skip
 
     def _add_switches(self) -> None:
         gui, own = self._client.gui, self._transfers.weights is None
-        self._refine = gui.add_checkbox("Refine", False, hint="pull the edges back to the target's")
-        self._smooth = gui.add_checkbox("Smooth", False, hint=f"frames over {_SMOOTH_FRAMES} of them")
-        self._align = gui.add_checkbox(
-            "Align", False, hint="find how each mesh stands", visible=not self._transfers.finds_standing
+        self._refine = gui.add_checkbox(
+            "Refine", False, hint="pulls the surface back to the target's: its edges get the lengths they had there"
         )
-        self._force = gui.add_checkbox("Force", False, hint="pose even a person like an animal", visible=own)
+        self._smooth = gui.add_checkbox(
+            "Smooth", False, hint=f"smooths a sequence in time, over {_SMOOTH_FRAMES} frames; one mesh stays as it is"
+        )
+        self._align = gui.add_checkbox(
+            "Align", False, hint="finds how each mesh stands", visible=not self._transfers.finds_standing
+        )
+        self._force = gui.add_checkbox(
+            "Force",
+            False,
+            hint="poses a person like an animal, or an animal like a person, which is refused otherwise: a pose of the "
+            "one says nothing of the other",
+            visible=own,
+        )
         self._project = gui.add_dropdown(
-            "Project", (_WITHOUT, "human", "animals"), hint="fit the target's rigid parts", visible=not own
+            "Project",
+            (_WITHOUT, "human", "animals"),
+            hint="fits the target's rigid parts, as these weights see them, to the output: each keeps its shape",
+            visible=not own,
         )
         axes = (_AS_FOUND, "X", "Y", "Z", "-X", "-Y", "-Z")
         self._up = gui.add_dropdown("Up", axes, hint="where the heads of your meshes are")
@@ -140,11 +161,13 @@ class Page:
             self._moving = gui.add_checkbox("Play", False, hint="a made-up source, through its next poses or its file")
             self._errors = gui.add_checkbox("Error map", False, hint="known where both bodies are made up")
             self._legend = gui.add_html("")
-            buttons = [gui.add_button(f"Download {kind}", icon=viser.Icon.DOWNLOAD) for kind in ("GLB", "OBJ")]
+            self._downloads = [
+                gui.add_button(f"Download {kind}", icon=viser.Icon.DOWNLOAD, disabled=True) for kind in ("GLB", "OBJ")
+            ]
             view = gui.add_button("Reset the view", icon=viser.Icon.VIEWFINDER, color="gray")
         self._moving.on_update(lambda _: self.ask())
         self._errors.on_update(lambda _: self._choose_errors())
-        for suffix, button in zip((".glb", ".obj"), buttons, strict=True):
+        for suffix, button in zip((".glb", ".obj"), self._downloads, strict=True):
             button.on_click(self._downloading(suffix))
         view.on_click(lambda _: self._stage.reset())
 
@@ -175,6 +198,10 @@ class Page:
                     self._client.add_notification("Left out", "\n".join(result.left_out), color="yellow")
 
         return download
+
+    def _offer_downloads(self, is_there: bool) -> None:
+        for button in self._downloads:
+            button.disabled = not is_there
 
     def _choose_errors(self) -> None:
         outcome = self.session.outcome

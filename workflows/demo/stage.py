@@ -73,6 +73,14 @@ class Stage:
         """Put words behind a body's label."""
         self._shown[role].label.text = f"{ROLES[role]}{words and f' · {words}'}"
 
+    def clear(self) -> None:
+        """Take the bodies away."""
+        for role, its in self._shown.items():
+            if its.body is not None:
+                its.body.remove()
+            its.body = None
+            self.say(role)
+
     def arrange(self) -> None:
         """Set the bodies beside each other, and the camera where it sees them all, if they or the window changed."""
         self._line_up()

@@ -36,6 +36,22 @@ def seen(width: int, height: int) -> np.ndarray[Any, Any]:
     return np.stack([0.5 + flat[:, 0] / camera.aspect / 2, 0.5 - flat[:, 1] / 2], axis=1)
 
 
+def test_bodies_that_are_taken_away_are_shown_again() -> None:
+    client = MagicMock()
+    stage = Stage(client)
+    mesh = Mesh(BOX, np.array([[0, 1, 2]]))
+    for _ in range(2):
+        for role in ROLES:
+            stage.show(role, mesh, unit=1.7)
+        bodies = [its.body for its in stage._shown.values()]
+        stage.say("output", "PMD")
+        stage.clear()
+        assert all(its.body is None for its in stage._shown.values())
+        assert stage._shown["output"].label.text == ROLES["output"]
+    assert client.scene.add_mesh_simple.call_count == 2 * len(ROLES)
+    assert bodies[0].remove.call_count == 2 * len(ROLES)  # type: ignore[union-attr]
+
+
 @pytest.mark.parametrize(
     ("width", "height", "lowest"),
     [(1100, 900, 1.0), (480, 800, 0.4), (360, 640, 0.4), (780, 1600, 0.4), (540, 400, 0.4), (568, 320, 0.4)],

@@ -83,6 +83,13 @@ def posed(page: Browser) -> str:
     return str(page.wait(lambda: re.search(r"([\d,]+) vertices in [\d.]+ s", page.text()))[1])
 
 
+def is_disabled(page: Browser, button: str) -> bool:
+    """Whether a button cannot be pressed."""
+    return bool(
+        page.run(f"[...document.querySelectorAll('button')].find(e => e.innerText.trim() === '{button}').disabled")
+    )
+
+
 def downloaded(page: Browser, name: str) -> bool:
     """Whether a download brings the result of that name, which is there as soon as it is posed."""
     page.click("Download OBJ")
@@ -103,6 +110,13 @@ def test_upload_transfer_download_refusals_and_memory(
     before, after = load_mesh(meshes[1]), load_mesh(result)
     assert np.array_equal(before.faces, after.faces)
     assert np.abs(before.vertices - after.vertices).max() > 0.02
+
+    page.click("Play")
+    page.wait_for_text("Not posed. pose.obj is one mesh: frames to play come as a .zip")
+    assert is_disabled(page, "Download OBJ") and is_disabled(page, "Download GLB")
+    page.click("Play")
+    page.wait(lambda: posed(page) == "615")
+    assert not is_disabled(page, "Download OBJ")
 
     broken = tmp_path / "broken.obj"
     broken.write_bytes(meshes[0].read_bytes().replace(b"f 1", b"f 99999", 1))

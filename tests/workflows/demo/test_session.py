@@ -28,7 +28,7 @@ from training.inference.orientation import Axes
 from training.inference.standing import Standing
 from workflows.cli import main as cli
 from workflows.demo.bodies import Figure
-from workflows.demo.captions import label, legend, plain
+from workflows.demo.captions import about, label, legend, plain
 from workflows.demo.poses import PERSON, Pose
 from workflows.demo.session import Newest, Session
 from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of, require_room
@@ -215,6 +215,19 @@ def test_messages_name_the_controls_of_the_page_and_no_folder_of_the_server(legs
     assert not any("--" in line for line in lines)
 
 
+def test_words_are_explained_where_they_are_said(session: Session, view: Seen, legs: list[Path]) -> None:
+    session.ask(Asked((legs[1],), (legs[0],), STANDING))
+    view.wait()
+    outcome = session.outcome
+    assert outcome is not None
+    outcome.warnings = []
+    assert not any(word in about(outcome, session.folder) for word in ("misfit", "PMD"))
+    outcome.warnings = ["leg.obj is unlike the bodies of training (misfit 0.02)"]
+    assert "*misfit*: how badly the weights understand a mesh" in about(outcome, session.folder)
+    outcome.frames[0] = replace(outcome.frames[0], pmd=1e-4)
+    assert "*PMD*: point-wise mesh distance" in about(outcome, session.folder)
+
+
 def test_a_broken_file_is_refused_in_one_line_and_the_last_one_stays(session: Session, legs: list[Path]) -> None:
     kept = upload(session, "source", legs[0])
     with pytest.raises(MeshError, match=r"broken\.obj") as refused:
@@ -240,6 +253,23 @@ def test_what_cannot_be_posed_is_said_and_the_next_can(session: Session, view: S
     assert view.frames and session.outcome is not None
 
 
+def test_nothing_is_offered_that_is_not_of_the_meshes_that_were_refused(
+    session: Session, view: Seen, legs: list[Path]
+) -> None:
+    target = upload(session, "target", legs[0])
+    session.ask(Asked((legs[1],), target, STANDING))
+    view.wait()
+    assert session.result(".obj").name == "leg0-posed.obj"
+    with pytest.raises(MeshError):  # what is shown stays, as what is chosen does
+        session.keep("target", "broken.obj", b"v 0 0 0\nf 1 2 9\n")
+    assert session.result(".obj").name == "leg0-posed.obj"
+    session.ask(Asked((legs[2],), target, STANDING, moving=True))
+    view.wait()
+    assert view.failures and session.outcome is None
+    with pytest.raises(MeshError, match="nothing is posed"):
+        session.result(".obj")
+
+
 def test_more_vertices_than_the_page_takes(session: Session, legs: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workflows.demo.transfers.VERTEX_LIMIT", 10)
     with pytest.raises(MeshError, match="the page takes 10: decimate it, or use dsffnet transfer"):
@@ -247,7 +277,7 @@ def test_more_vertices_than_the_page_takes(session: Session, legs: list[Path], m
 
 
 def test_nothing_to_download_before_anything_is_posed(session: Session) -> None:
-    with pytest.raises(MeshError, match="nothing is posed yet"):
+    with pytest.raises(MeshError, match="nothing is posed: choose a source and a target"):
         session.result(".glb")
 
 
