@@ -36,8 +36,8 @@ install: $(READY) ## the environment alone, .venv: enough to pose your own meshe
 run: $(READY) ## the quickstart: generate data, train, evaluate, show (about 12 minutes on 2 cores)
 	@$(BIN)/python workflows/full.py $(ARGS)
 
-test: $(READY) ## the test suite
-	@$(BIN)/python -m pytest $(ARGS)
+test: $(READY) ## the test suite, by as many processes as there are CPUs, at most four (ARGS="-n 0": by one)
+	@$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
 
 test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a job submitted to them
 	@$(BIN)/python -m pytest -m cluster $(ARGS)
