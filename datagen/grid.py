@@ -322,6 +322,17 @@ class GridArrays:
         """The array that holds an identity, and its place along the first axis (KeyError where there is none)."""
         return self._rows[identity]
 
+    def strips(self, split: Split) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The row of shards of each identity [identity] of a split, and the column of each pose [pose], from 0.
+
+        Where arrays differ in the poses of a shard, the columns are those of the widest.
+        """
+        members = [self.row_of(identity) for identity in self.grid.identities(split)]
+        places = [(array.topology, row // array.room[0]) for array, row in members]
+        widest = max((array for array, _ in members), key=lambda array: array.room[1])
+        rows = np.unique(places, axis=0, return_inverse=True)[1].ravel()
+        return rows, np.flatnonzero(widest.poses != HOLE) // widest.room[1]
+
     @property
     def shard_count(self) -> int:
         """How many shards there are; it lists none."""

@@ -228,9 +228,30 @@ class Dataset:
             meshes[places] = self._from_shard(shard_path(array.place(band, number)), codec, rows)
         return meshes
 
-    def _from_shard(self, path: str, codec: ShardCodec, rows: NDArray[np.int64]) -> Meshes:
+    def shard_vertices(self, identities: Sequence[int], poses: Sequence[int] | NDArray[np.integer]) -> Meshes:
+        """Vertices [mesh, vertex, 3] float32 in metres of meshes (identity, pose) of one shard, read whole at once.
+
+        Raises
+        ------
+        DatasetError
+            The shard is missing or damaged.
+        ValueError
+            They do not all lie in one shard.
+        """
+        array, _ = self.arrays.row_of(identities[0])
+        codec = self._checked(array)
+        members = {identity: self.arrays.row_of(identity) for identity in set(identities)}
+        row = np.array([members[identity][1] for identity in identities])
+        column = np.array([array.columns[int(pose)] for pose in poses])
+        band, place = row // codec.identities, column // codec.poses
+        if any(held is not array for held, _ in members.values()) or np.ptp(band) or np.ptp(place):
+            raise ValueError("the meshes lie in several shards")
+        rows = row % codec.identities * codec.poses + column % codec.poses
+        return self._from_shard(shard_path(array.place(int(band[0]), int(place[0]))), codec, rows, whole=True)
+
+    def _from_shard(self, path: str, codec: ShardCodec, rows: NDArray[np.int64], *, whole: bool = False) -> Meshes:
         try:
-            if len(rows) * _TOGETHER_FROM >= codec.rows:
+            if whole or len(rows) * _TOGETHER_FROM >= codec.rows:
                 return codec.decode(self._bytes(path), rows)
             index = self._index(path, codec)
             if len(rows) * _TOGETHER_FROM >= codec.poses:

@@ -1,8 +1,9 @@
 """Meshes of a dataset that is larger than memory: read when needed, the last used ones kept, memory bounded.
 
-A mesh, not a shard, is what is kept. Triples are random over the whole grid, so a batch touches nearly as many shards
-as meshes; were shards kept, one mesh in a hundred of them would be of use soon. Meshes of many steps are asked for
-together, and a shard is decoded whole where that costs less than asking the store for each of its wanted meshes.
+Where triples are random over the whole grid, a mesh, not a shard, is what is kept: a batch touches nearly as many
+shards as meshes; were shards kept, one mesh in a hundred of them would be of use soon. Meshes of many steps are asked
+for together, and a shard is decoded whole where that costs less than asking the store for each of its wanted meshes.
+Where triples come in blocks of shards (:class:`training.data.triples.BlockOrder`), whole shards are read and kept.
 """
 
 import threading
@@ -30,10 +31,12 @@ class StreamedMeshes:
     ----------
     memory
         Bytes for meshes.
+    whole
+        Read and keep whole shards.
     """
 
-    def __init__(self, layout: Layout, *, memory: int) -> None:
-        self._layout, self.rows = layout, int(layout.counts.max())
+    def __init__(self, layout: Layout, *, memory: int, whole: bool = False) -> None:
+        self._layout, self._whole, self.rows = layout, whole, int(layout.counts.max())
         self.slots = min(max(_FEWEST_SLOTS, memory // (12 * self.rows)), len(layout.counts))
         self._held = torch.from_numpy(np.zeros((self.slots, self.rows, 3), np.float32))  # takes memory as it fills
         self._slot: OrderedDict[int, int] = OrderedDict()
@@ -42,6 +45,11 @@ class StreamedMeshes:
         self._request_bytes = _REMOTE_REQUEST_BYTES if remote else _LOCAL_REQUEST_BYTES
         readers = _REMOTE_READERS if remote else _LOCAL_READERS
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="stream")
+
+    @property
+    def together(self) -> int:
+        """Meshes to ask for at a time: of whole shards a quarter is room for those that the meshes asked for bring."""
+        return self.slots * 3 // 4 if self._whole else self.slots
 
     def close(self) -> None:
         """End the reading threads."""
@@ -63,14 +71,18 @@ class StreamedMeshes:
                 f"a batch needs {len(wanted)} meshes at once, but streaming has memory for {self.slots} "
                 f"({bytes_text(12 * self.rows * self.slots)}). Lower training.batch"
             )
+        shards, read = self._layout.shards, self._read
+        if self._whole and len(whole := self._layout.whole_files(wanted)) <= self.slots:
+            wanted, shards, read = whole, self._layout.files, self._layout.read_file
         with self._guard:
             missing = np.array([mesh for mesh in wanted.tolist() if mesh not in self._slot], np.int64)
             for mesh in np.setdiff1d(wanted, missing).tolist():
                 self._slot.move_to_end(mesh)
-            places = np.flatnonzero(np.diff(self._layout.shards[missing])) + 1
+            missing = missing[np.argsort(shards[missing], kind="stable")]
+            places = np.flatnonzero(np.diff(shards[missing])) + 1
             by_shard = [some for some in np.split(missing, places) if len(some)]
-            for some, read in zip(by_shard, self._readers.map(self._read, by_shard), strict=True):
-                self._hold(some, read)
+            for some, found in zip(by_shard, self._readers.map(read, by_shard), strict=True):
+                self._hold(some, found)
 
     def _read(self, meshes: NDArray[np.int64]) -> Floats:
         """Vertices [mesh, vertex, 3] of some meshes of one shard, which is decoded whole if that is quicker."""
@@ -93,7 +105,8 @@ class StreamedMeshes:
 
     def _gathered(self, meshes: NDArray[np.int64]) -> Tensor:
         with self._guard:
-            self.fetch(meshes)
+            if not self._slot.keys() >= set(meshes.tolist()):
+                self.fetch(meshes)
             slots = torch.tensor([self._slot[int(mesh)] for mesh in meshes])
             rows = int(self._layout.counts[meshes].max())
             return self._held[:, :rows].index_select(0, slots)

@@ -1,16 +1,18 @@
-"""Which triples a training shows, and in which order."""
+"""Which triples a training shows, and in which order: shuffled over the whole grid, or in blocks of its shards."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError
+from datagen.common.errors import DatasetError, RecipeError
+from datagen.common.resources import bytes_text
 from datagen.common.seeding import Stream, generator
 from datagen.store import Dataset
 from training.data.order import BatchOrder
-from training.recipes.training import TrainingRecipe
+from training.recipes.training import TrainingRecipe, block_bytes
 
 Triples = NDArray[np.integer]
 """Rows [triple, 4] of (source identity, source pose, target identity, target pose)."""
@@ -34,10 +36,16 @@ def order_of(recipe: TrainingRecipe, dataset: Dataset) -> "TripleOrder":
 
     Raises
     ------
-    DatasetError
-        See :class:`TripleOrder`.
+    DatasetError, RecipeError
+        See :class:`TripleOrder`, :class:`BlockOrder`.
     """
-    return TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=recipe.batch, seed=recipe.seed)
+    identities, poses = dataset.identities("training"), dataset.grid.poses("seen")
+    if recipe.block is None:
+        return TripleOrder(identities, poses, batch=recipe.batch, seed=recipe.seed)
+    rows, columns = dataset.arrays.strips("training")
+    mesh_bytes = 12 * max(dataset.vertex_count(identity) for identity in identities)
+    room = Block(Strips(rows), Strips(columns), meshes=block_bytes(recipe.block) // mesh_bytes, mesh_bytes=mesh_bytes)
+    return BlockOrder(identities, poses, room, batch=recipe.batch, seed=recipe.seed)
 
 
 def last_step_of(recipe: TrainingRecipe, dataset: Dataset) -> int:
@@ -69,9 +77,162 @@ class TripleOrder(BatchOrder):
     def cells(self) -> int:
         return len(self.identities) * len(self.poses)
 
+    def memory(self, *, rank: int = 0, ranks: int = 1) -> int | None:
+        """Bytes of the meshes that this rank's triples need for a while; None: of all meshes, at any time."""
+        return None
+
     def epoch(self, number: int) -> NDArray[np.int64]:
         """An epoch's triples, by the dataset's numbers of identities and poses."""
         identities, poses = np.asarray(self.identities), np.asarray(self.poses)
         triples = epoch_triples(identities=len(identities), poses=len(poses), seed=self.seed, epoch=number)
         source, source_pose, target, target_pose = triples.T
         return np.stack([identities[source], poses[source_pose], identities[target], poses[target_pose]], axis=1)
+
+
+class Strips:
+    """What lies along one axis of the grid, in strips: those that lie in one row, or one column, of shards.
+
+    Parameters
+    ----------
+    of
+        The strip of each [number], from 0.
+    """
+
+    def __init__(self, of: NDArray[np.integer]) -> None:
+        self.of, self.sizes = of, np.bincount(of)
+        self._members, self._starts = np.argsort(of, kind="stable"), np.cumsum(self.sizes) - self.sizes
+        self._place = np.empty(len(of), np.int64)
+        self._place[self._members] = np.arange(len(of)) - self._starts[of[self._members]]
+
+    @property
+    def groups(self) -> int:
+        """How many groups of two strips there are; the last one has three where their number is odd."""
+        return max(1, len(self.sizes) // 2)
+
+    def group(self, place: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The group of a strip at a place of a shuffled list of strips."""
+        return np.minimum(place // 2, self.groups - 1)
+
+    def others(
+        self, random: np.random.Generator, of: NDArray[np.integer], lists: NDArray[np.int64], which: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Another than each of ``of`` [n], from its strip or another one of its group.
+
+        Over all lists each other is drawn alike often, where strips are equally long.
+
+        Parameters
+        ----------
+        lists
+            Shuffled lists of all strips [list, strip].
+        which
+            The list that holds for each [n].
+        """
+        strip, count = self.of[of], len(self.of)
+        size, place = self.sizes[strip], np.argsort(lists, axis=1)[which, strip]
+        first = 2 * self.group(place)
+        strips = np.where(first == 2 * (self.groups - 1), len(self.sizes) - first, 2)
+        next_to = first + (place - first + 1 + random.integers(0, np.maximum(strips - 1, 1))) % strips
+        elsewhere = lists[which, next_to]
+        there = self._starts[elsewhere] + random.integers(0, self.sizes[elsewhere])
+        here = self._starts[strip] + (self._place[of] + 1 + random.integers(0, np.maximum(size - 1, 1))) % size
+        return self._members[np.where(random.random(len(of)) * (count - 1) < size - 1, here, there)]
+
+
+@dataclass(frozen=True)
+class Block:
+    """The shards of a training grid, by rows of identities and columns of poses, and how many meshes may be held."""
+
+    rows: Strips
+    columns: Strips
+    meshes: int
+    mesh_bytes: int
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of an epoch."""
+        return self.rows.groups * self.columns.groups
+
+    @property
+    def tile(self) -> float:
+        """Meshes of a tile, in the mean."""
+        return len(self.rows.of) * len(self.columns.of) / self.tiles
+
+
+_HELD_TILES, _EPOCH_TILES = 4, 8
+"""Of each lane at least: that a block holds, so that triples of several are mixed; that an epoch has, as those at its
+two ends are read by two lanes."""
+
+
+@dataclass(frozen=True)
+class BlockOrder(TripleOrder):
+    """An order for meshes that do not fit into memory: each shard is needed once an epoch, for a while.
+
+    An epoch pairs the columns of shards by chance and, for each pair of columns, the rows of shards: four shards are a
+    tile (six or nine where a number is odd). The meshes of a triple lie in one tile. The tiles come in random order,
+    the triples of a tile in random order; then each triple is put off by a random number of places, up to a
+    ``reach``, so that those of several tiles mix.
+
+    A batch has ``lanes`` equal parts, each of which goes through a stretch of tiles of its own: ranks that share
+    lanes as a whole read each tile once, all together, and the triples do not depend on how many ranks there are.
+
+    As in the full shuffle, each cell (target identity, source pose) is the truth once an epoch, and any single triple
+    has the same distribution, where shards are equally large. (Else a pose of a smaller shard is the target's more
+    often, by as much as it is smaller, and so is an identity the source's.) What differs: triples that are near in the
+    order share identities and poses.
+
+    Raises
+    ------
+    RecipeError
+        The block is too small for its four tiles.
+    """
+
+    block: Block
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        least = int(_HELD_TILES * self.block.tile) + 1
+        if self.block.meshes < least:
+            raise RecipeError(
+                f"training.block holds {self.block.meshes:,} meshes of {bytes_text(self.block.mesh_bytes)}, but "
+                f"{_HELD_TILES} tiles of this dataset's shards have {least:,}. Set it to "
+                f"{bytes_text(1.1 * least * self.block.mesh_bytes).replace(' ', '').replace(',', '')} or more"
+            )
+
+    @cached_property
+    def lanes(self) -> int:
+        """Parts of a batch that go through tiles of their own."""
+        most = min(self.block.meshes / (_HELD_TILES * self.block.tile), self.block.tiles / _EPOCH_TILES)
+        return max(lanes for lanes in range(1, self.batch + 1) if self.batch % lanes == 0 and lanes <= max(1, most))
+
+    @property
+    def reach(self) -> float:
+        """Places of its lane that a triple is put off at most."""
+        return 0.75 * self.block.meshes / self.lanes - 2 * self.block.tile  # the rest is for what is read ahead
+
+    def memory(self, *, rank: int = 0, ranks: int = 1) -> int:
+        ((start, stop),), width = self._cuts(rank=rank, ranks=ranks, parts=1), self.batch // self.lanes
+        lanes = (stop - 1) // width - start // width + 1
+        return self.block.meshes * self.block.mesh_bytes * lanes // self.lanes
+
+    def epoch(self, number: int) -> NDArray[np.int64]:
+        """An epoch's triples, by the dataset's numbers of identities and poses."""
+        random = generator(self.seed, Stream.TRAINING_TRIPLES, number)
+        rows, columns = self.block.rows, self.block.columns
+        target, source_pose = np.divmod(random.permutation(self.cells), len(self.poses))
+        column_list = random.permutation(len(columns.sizes))[None]
+        row_lists = random.permuted(np.tile(np.arange(len(rows.sizes)), (columns.groups, 1)), axis=1)
+        group = columns.group(np.argsort(column_list[0])[columns.of[source_pose]])
+        tile = group * rows.groups + rows.group(np.argsort(row_lists, axis=1)[group, rows.of[target]])
+        source = rows.others(random, target, row_lists, group)
+        target_pose = columns.others(random, source_pose, column_list, np.zeros_like(group))
+        identities, poses = np.asarray(self.identities), np.asarray(self.poses)
+        triples = np.stack([identities[source], poses[source_pose], identities[target], poses[target_pose]], axis=1)
+        return self._mixed(random, triples[np.argsort(random.permutation(self.block.tiles)[tile], kind="stable")])
+
+    def _mixed(self, random: np.random.Generator, triples: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Triples tile by tile, in the order of the batches: put off, and dealt to the lanes."""
+        steps, width = self.steps_per_epoch, self.batch // self.lanes
+        lanes = np.arange(steps * self.batch).reshape(self.lanes, steps * width)
+        order = np.argsort(np.arange(steps * width) + random.uniform(0, self.reach, lanes.shape), axis=1)
+        dealt = np.take_along_axis(lanes, order, axis=1).reshape(self.lanes, steps, width).swapaxes(0, 1).ravel()
+        return np.concatenate([triples[dealt], triples[len(dealt) :]])

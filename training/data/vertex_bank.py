@@ -132,7 +132,7 @@ class VertexBank:
     def _steps_together(self, share: Share) -> int:
         """How many steps' meshes to ask for together: no more than are held at a time."""
         assert isinstance(self._meshes, StreamedMeshes)
-        window = min(self._meshes.slots, _TOGETHER_BYTES // (12 * self._meshes.rows))
+        window = min(self._meshes.together, _TOGETHER_BYTES // (12 * self._meshes.rows))
         return max(1, window // (3 * sum(len(triples) for triples in share)))
 
     def _prepare(self, shares: list[Share]) -> list[list[Batch]]:
@@ -171,6 +171,7 @@ def open_bank(
     cache: Cache = "auto",
     sharers: int = 1,
     edge_sum: EdgeSum = "edges",
+    block: int | None = None,
     memory: int | None = None,
 ) -> VertexBank:
     """Decode the meshes of some identities to a device where it has room for them; stream them else.
@@ -185,6 +186,8 @@ def open_bank(
         Processes of this machine that open the same bank.
     edge_sum
         Edges of a batch: every edge once, or the three sides of every face (NPT).
+    block
+        Bytes of meshes that triples in blocks of shards need at a time; None: triples over the whole grid.
     memory
         Bytes that streamed meshes may take; by default half of what is free, divided among the sharers.
 
@@ -203,9 +206,21 @@ def open_bank(
     if choice.place == "device":
         held = HeldMeshes(layout, decode(layout, device, sharers=sharers))
         return VertexBank(layout, held, edges, choice, device=device)
-    streamed = StreamedMeshes(layout, memory=stream_memory(sharers=sharers) if memory is None else memory)
-    why = f"{choice.why}; {bytes_text(12 * streamed.rows * streamed.slots)} held at a time"
+    free = stream_memory(sharers=sharers) if memory is None else memory
+    streamed = StreamedMeshes(layout, memory=free if block is None else min(block, free), whole=block is not None)
+    held_at_once = bytes_text(12 * streamed.rows * streamed.slots)
+    reads = _reads(block, free) if streamed.slots < len(layout.counts) else ""
+    why = f"{choice.why}; {held_at_once} held at a time{reads}"
     return VertexBank(layout, streamed, edges, replace(choice, why=why), device=device)
+
+
+def _reads(block: int | None, free: int) -> str:
+    """What the memory for streamed meshes means for the store that is read."""
+    if block is None:
+        return ", meshes read again and again (training.block has each shard read once an epoch; set it in a new run)"
+    if block > free:
+        return f", less than the {bytes_text(block)} of the block: shards are read more than once an epoch"
+    return ", each shard read about once an epoch"
 
 
 def _pinned(batch: Batch) -> Batch:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -54,8 +55,8 @@ class Layout:
         self._index[list(self.identities)] = np.arange(len(self.identities))
         self._split = np.array([SPLITS.index(grid.split(identity)) for identity in self.identities])
         self._place = np.stack([self._places_in(split) for split in SPLITS])
-        within = [self._shards_of(identity) for identity in self.identities]
-        self.shards = self._owner * (1 + max(shards[-1] for shards in within)) + np.concatenate(within)
+        self._columns = np.concatenate([self._shards_of(identity) for identity in self.identities])
+        self.shards = self._owner * (1 + self._columns.max()) + self._columns
 
     def _places_in(self, split: Split) -> NDArray[np.int64]:
         """Place of every pose among those of a split's identities; -1 where they were not made in it."""
@@ -69,6 +70,25 @@ class Layout:
         """The shard of each mesh of an identity, numbered along its poses."""
         array, _ = self.dataset.arrays.row_of(identity)
         return np.flatnonzero(array.poses != HOLE) // array.room[1]
+
+    @cached_property
+    def files(self) -> NDArray[np.int64]:
+        """A number for the whole shard that each mesh is in [mesh]; a shard may be of several identities."""
+        held = [self.dataset.arrays.row_of(identity) for identity in self.identities]
+        bands = [(SPLITS.index(array.split), array.topology, row // array.room[0]) for array, row in held]
+        numbers = np.unique(bands, axis=0, return_inverse=True)[1].ravel()
+        return numbers[self._owner] * (1 + self._columns.max()) + self._columns
+
+    @cached_property
+    def _by_file(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        order = np.argsort(self.files, kind="stable")
+        return order, self.files[order]
+
+    def whole_files(self, meshes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers of all meshes of the shards that hold some, ascending."""
+        order, files = self._by_file
+        first, end = (np.searchsorted(files, np.unique(self.files[meshes]), side) for side in ("left", "right"))
+        return np.sort(np.concatenate([order[start:stop] for start, stop in zip(first, end, strict=True)]))
 
     @property
     def vertices(self) -> int:
@@ -131,6 +151,20 @@ class Layout:
         poses = self.dataset.grid.poses_of(self.identities[owner])[asked - self._firsts[owner]]
         found = self.dataset.vertices(self.identities[owner], poses)
         return normalised(found if among is None else found[np.searchsorted(among, meshes)])
+
+    def read_file(self, meshes: NDArray[np.int64]) -> Floats:
+        """Normalised vertices [mesh, vertex, 3] of some meshes of one shard, which is read whole.
+
+        Raises
+        ------
+        DatasetError
+            The shard is missing or damaged.
+        """
+        owners, grid = self._owner[meshes], self.dataset.grid
+        identities = [self.identities[owner] for owner in owners.tolist()]
+        places = (meshes - self._firsts[owners]).tolist()
+        poses = [grid.poses_of(identity)[place] for identity, place in zip(identities, places, strict=True)]
+        return normalised(self.dataset.shard_vertices(identities, poses))
 
 
 def decode(layout: Layout, device: torch.device, *, sharers: int = 1) -> Tensor:

@@ -32,6 +32,7 @@ __all__ = [
     "PartsRecipe",
     "ScheduleRecipe",
     "TrainingRecipe",
+    "block_bytes",
     "budget_seconds",
 ]
 
@@ -40,6 +41,8 @@ ONE_CYCLE_WARM_UP = 0.1
 
 _BUDGET = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|h)")
 _SECONDS = {"s": 1, "min": 60, "h": 3600}
+_BLOCK = re.compile(r"(\d+(?:\.\d+)?)\s*(kB|MB|GB|TB)")
+_BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
 def budget_seconds(budget: str) -> float:
@@ -59,6 +62,25 @@ def budget_seconds(budget: str) -> float:
 def _is_time(budget: str) -> str:
     budget_seconds(budget)
     return budget
+
+
+def block_bytes(block: str) -> int:
+    """Bytes of a block such as ``500MB`` or ``16GB``.
+
+    Raises
+    ------
+    ValueError
+        It is not of that form.
+    """
+    found = _BLOCK.fullmatch(block.strip())
+    if found is None:
+        raise ValueError(f"block {block!r} is not a size such as 500MB or 16GB")
+    return int(float(found[1]) * _BYTES[found[2]])
+
+
+def _is_size(block: str) -> str:
+    block_bytes(block)
+    return block
 
 
 class ScheduleRecipe(Frozen):
@@ -203,6 +225,11 @@ class TrainingRecipe(Frozen):
         description="where decoded meshes are kept: device: all in the memory of the device that trains; stream: as "
         "many as memory has room for; auto: device where they fit",
     )
+    block: Annotated[str, AfterValidator(_is_size)] | None = Field(
+        None,
+        description="for data larger than memory: triples come in blocks of shards that take so much memory, all ranks "
+        "together, e.g. 16GB, and each shard is read about once an epoch; default: shuffled over the whole grid",
+    )
     log_every: int = Field(20, ge=1, description="steps between lines of metrics.jsonl")
     evaluate_every: int = Field(500, ge=1, description="steps between measurements on a fixed evaluation subset")
     evaluate_triples: int = Field(32, ge=1, description="triples of each pose type in that subset")
@@ -284,6 +311,7 @@ class TrainingRecipe(Frozen):
             "precision": self.precision not in ("float32", "float64"),
             "compile": self.compile,
             "augmentation": self.augmentation != AugmentationRecipe(),
+            "block": self.block is not None,
         }
         for field, is_set in unknown.items():
             if is_set:

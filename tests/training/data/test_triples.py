@@ -1,6 +1,7 @@
 """Triples: what they must be (DSFFNet, section 4.1), and in which order they come."""
 
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,18 @@ from datagen.poses import Poses
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import mixed_dataset, tiny_dataset
-from training.data.triples import TripleOrder, epoch_triples
+from training.data.triples import Block, BlockOrder, Strips, TripleOrder, epoch_triples
 from training.data.vertex_bank import open_bank
+
+
+def blocks(
+    *, identities: int, poses: int, height: int, width: int, held: float = 4.5, batch: int = 4, seed: int = 0
+) -> BlockOrder:
+    """The order of a grid whose shards have so many identities and poses; ``held``: tiles that a block holds."""
+    rows, columns = Strips(np.arange(identities) // height), Strips(np.arange(poses) // width)
+    tile = Block(rows, columns, meshes=0, mesh_bytes=1).tile
+    block = Block(rows, columns, meshes=int(held * tile) + 1, mesh_bytes=384)
+    return BlockOrder(range(identities), range(poses), block, batch=batch, seed=seed)
 
 
 @given(st.integers(2, 12), st.integers(2, 30), st.integers(0, 5), st.integers(0, 9))
@@ -37,9 +48,83 @@ def test_epochs_and_seeds_differ_and_repeat() -> None:
     assert not np.array_equal(triples(0, 0), triples(0, 1)) and not np.array_equal(triples(0, 0), triples(1, 0))
 
 
+GRIDS = st.fixed_dictionaries(
+    {
+        "identities": st.integers(2, 20),
+        "poses": st.integers(2, 40),
+        "height": st.integers(1, 6),
+        "width": st.integers(1, 9),
+        "held": st.floats(4, 80),
+        "batch": st.integers(1, 4),
+        "seed": st.integers(0, 3),
+    }
+)
+
+
+@given(GRIDS, st.integers(0, 9))
+def test_blocks_show_every_cell_once_as_truth_from_the_meshes_of_its_tile(grid: dict[str, Any], epoch: int) -> None:
+    order = blocks(**grid)
+    triples = order.epoch(epoch)
+    source, source_pose, target, target_pose = triples.T
+    assert len({(t, p) for t, p in zip(target, source_pose, strict=True)}) == order.cells == len(triples)
+    assert (source != target).all() and (source_pose != target_pose).all()
+    for values, count in ((source, order.identities), (target_pose, order.poses)):
+        assert values.min() >= 0 and values.max() < len(count)
+    rows, columns = order.block.rows.of, order.block.columns.of
+    near: dict[tuple[int, int], set[int]] = {}  # of a row of shards in a column: the rows that it is paired with
+    for s, p, t, q in triples.tolist():
+        near.setdefault((rows[t], columns[p]), set()).add(rows[s])
+        near.setdefault((-1, columns[p]), set()).add(columns[q])
+    assert all(len(others) <= 3 for others in near.values()), "a group has two strips, or three"
+    assert np.array_equal(triples, blocks(**grid).epoch(epoch)), "a function of its arguments"
+
+
+def test_a_triple_of_blocks_is_distributed_as_one_of_the_full_shuffle() -> None:
+    """Where shards are equally large: every other identity and every other pose alike often, together, too."""
+    order = blocks(identities=6, poses=8, height=2, width=2)
+    epochs = np.concatenate([order.epoch(number) for number in range(1500)])
+    source, source_pose, target, target_pose = epochs.T
+    for own, other, count in ((target, source, 6), (source_pose, target_pose, 8)):
+        times = np.bincount(own * count + other, minlength=count * count).reshape(count, count)
+        expected = len(epochs) / count / (count - 1)
+        off = np.abs(times[~np.eye(count, dtype=bool)] - expected)
+        assert times.diagonal().sum() == 0 and off.max() < 5 * expected**0.5, times
+    both = np.bincount((source - target) % 6 * 8 + (target_pose - source_pose) % 8, minlength=48).reshape(6, 8)[1:, 1:]
+    assert np.abs(both - both.mean()).max() < 5 * both.mean() ** 0.5
+
+
+def test_a_mesh_of_blocks_is_source_and_target_once_an_epoch_on_average() -> None:
+    order = blocks(identities=6, poses=8, height=2, width=2)
+    epochs = np.concatenate([order.epoch(number) for number in range(400)])
+    for identity, pose in ((0, 1), (2, 3)):
+        times = np.bincount(epochs[:, identity] * 8 + epochs[:, pose], minlength=48) / 400
+        assert np.abs(times - 1).max() < 5 / 20
+
+
+@given(GRIDS)
+def test_blocks_need_few_meshes_at_a_time_and_each_shard_for_a_while(grid: dict[str, Any]) -> None:
+    """A lane has the triples of its stretch of tiles, none put off by more than the reach."""
+    order = blocks(**grid)
+    steps, width = order.steps_per_epoch, order.batch // order.lanes
+    rows, columns = order.block.rows, order.block.columns
+    mesh = rows.sizes.max() * columns.sizes.max()
+    triples = order.epoch(0)[: steps * order.batch].reshape(steps, order.lanes, width, 4)
+    for lane in range(order.lanes):
+        shard = [(rows.of[t], columns.of[p]) for _, p, t, _ in triples[:, lane].reshape(-1, 4).tolist()]
+        spans = {key: len(shard) - shard[::-1].index(key) - shard.index(key) for key in set(shard)}
+        assert max(spans.values()) <= order.reach + 9 * mesh + 1
+
+
+SHUFFLED = TripleOrder(identities=[3, 5, 8], poses=range(10, 17), batch=12, seed=2)
+BLOCK = Block(Strips(np.arange(3)), Strips(np.arange(7) // 2), meshes=90, mesh_bytes=1)
+IN_BLOCKS = BlockOrder([3, 5, 8], range(10, 17), BLOCK, batch=12, seed=2)
+
+
+@pytest.mark.parametrize("order", [SHUFFLED, IN_BLOCKS], ids=["shuffled", "blocks"])
 @given(st.sampled_from([1, 2, 3, 6]), st.sampled_from([1, 2]), st.integers(0, 40))
-def test_the_order_is_the_same_for_any_ranks_any_parts_and_any_start(ranks: int, parts: int, first: int) -> None:
-    order = TripleOrder(identities=[3, 5, 8], poses=range(10, 17), batch=12, seed=2)
+def test_the_order_is_the_same_for_any_ranks_any_parts_and_any_start(
+    order: TripleOrder, ranks: int, parts: int, first: int
+) -> None:
     shares = [order.batches(first_step=first, rank=rank, ranks=ranks, parts=parts) for rank in range(ranks)]
     together = [[part for share in shares for part in next(share)] for _ in range(4)]
     assert {len(part) for step in together for part in step} == {12 // (ranks * parts)}
@@ -75,6 +160,21 @@ def test_a_batch_larger_than_the_grid() -> None:
 def test_a_grid_without_another_identity() -> None:
     with pytest.raises(DatasetError, match="has 1 identities in 9 poses"):
         TripleOrder(identities=[4], poses=range(9), batch=2, seed=0)
+
+
+def test_lanes_are_whole_parts_of_a_batch_that_ranks_share() -> None:
+    order = blocks(identities=16, poses=60, height=1, width=2, held=20, batch=8)  # 120 tiles
+    assert order.lanes == 4
+    whole = order.memory()
+    assert [order.memory(rank=rank, ranks=4) for rank in range(4)] == [whole // 4] * 4
+    assert [order.memory(rank=rank, ranks=3) for rank in range(3)] == [whole // 2, whole // 2, whole // 4]
+    assert order.memory(rank=5, ranks=8) == whole // 4 and blocks(identities=2, poses=4, height=1, width=1).lanes == 1
+    assert TripleOrder(range(3), range(7), batch=8, seed=0).memory() is None
+
+
+def test_a_block_that_is_too_small_for_the_shards_is_refused() -> None:
+    with pytest.raises(RecipeError, match=r"block holds 30 meshes of 0.4 kB, but 4 tiles .* have 65. Set it to .* or"):
+        blocks(identities=8, poses=8, height=2, width=2, held=1.85)
 
 
 def test_ranks_that_cannot_share_equally_share_all_of_a_batch() -> None:

@@ -13,14 +13,14 @@ import torch
 from datagen.common import resources
 from datagen.common.errors import DatasetError, RecipeError
 from datagen.generate import generate
-from datagen.store import Dataset, open_dataset
+from datagen.store import Dataset, open_dataset, reader
 from tests.support.files import flip_bit, truncate
-from tests.support.recipes import mixed_dataset, tiny_dataset
+from tests.support.recipes import mixed_dataset, tiny_dataset, tiny_training
 from tests.training.data.test_batch import same
 from training.data.batch import Batch
 from training.data.cache_policy import Room, choose, room_of
 from training.data.prefetch import Share
-from training.data.triples import TripleOrder
+from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.objectives.losses import transfer_loss
 
@@ -40,9 +40,9 @@ def training_bank(dataset: Dataset, cache: Any = "device", **options: Any) -> Ve
 
 
 def steps(
-    bank: VertexBank, dataset: Dataset, *, count: int, first: int = 0, parts: int = 2
+    bank: VertexBank, dataset: Dataset, *, count: int, first: int = 0, parts: int = 2, order: TripleOrder | None = None
 ) -> list[tuple[Share, list[Batch]]]:
-    order = TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=12, seed=5)
+    order = order or TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=12, seed=5)
     shares = islice(bank.prefetch(order.batches(first_step=first, parts=parts)), count)
     return [(share, [bank.batch(triples) for triples in share]) for share in shares]
 
@@ -62,6 +62,38 @@ def test_both_caches_give_the_same_bits_in_the_same_order(legs: Dataset) -> None
         assert streamed.place == "stream" and equal_steps(steps(streamed, legs, count=36, first=4), expected)
         assert all(same(streamed.batch(share[0]), batches[0]) for share, batches in expected[:5]), "not prefetched"
         streamed.close()
+
+
+def test_blocks_give_the_same_bits_whatever_memory_holds(legs: Dataset) -> None:
+    order = order_of(tiny_training(block="0.06MB", batch=12), legs)
+    expected = steps(training_bank(legs), legs, count=36, first=4, order=order)
+    for memory in (None, 0):  # the block, and 64 meshes
+        streamed = training_bank(legs, "stream", memory=memory, block=order.memory())
+        assert equal_steps(steps(streamed, legs, count=36, first=4, order=order), expected), streamed.where
+        assert ("of the block: shards are read more" if memory == 0 else "read about once") in streamed.where
+        streamed.close()
+
+
+@pytest.mark.parametrize("shape", [(8, 64), (80, 4)], ids=["a shard of one identity", "of several"])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_blocks_read_each_shard_about_once_an_epoch(
+    shape: tuple[int, int], ranks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    identities, poses = shape
+    counts = {"identities": {"training": identities, "evaluation": 0}, "poses": {"seen": poses, "unseen": 0}}
+    recipe = tiny_dataset(**counts, triples={"count": 0}, store={"poses_per_shard": 4 if poses == 64 else 8})
+    dataset = open_dataset(generate(recipe, str(tmp_path / "legs.zarr")).url)
+    order = order_of(tiny_training(block="60kB", batch=8), dataset)
+    asked: list[str] = []
+    real = reader.read_bytes
+    monkeypatch.setattr(reader, "read_bytes", lambda group, path, **how: asked.append(path) or real(group, path, **how))
+    for rank in range(ranks):
+        bank = training_bank(dataset, "stream", block=order.memory(rank=rank, ranks=ranks))
+        for share in islice(bank.prefetch(order.batches(first_step=0, rank=rank, ranks=ranks)), order.steps_per_epoch):
+            bank.batch(share[0])
+        bank.close()
+    assert len(dataset.sizes) == (128 if poses == 64 else 40) and set(asked) == set(dataset.sizes)
+    assert len(asked) <= 1.2 * len(dataset.sizes), len(asked) / len(dataset.sizes)
 
 
 @pytest.mark.gpu

@@ -87,6 +87,17 @@ def test_stop_and_resume_equals_uninterrupted_to_the_bit(dataset: str, undisturb
     assert torch.equal(losses(stopped), losses(undisturbed))
 
 
+def test_blocks_are_resumed_to_the_bit_by_any_cache_and_are_no_other_runs(dataset: str, tmp_path: Path) -> None:
+    recipe = tiny_training(block="0.03MB")
+    train(recipe, data=dataset, run=tmp_path / "whole")
+    shutil.copytree(tmp_path / "whole", tmp_path / "stopped")
+    shutil.rmtree(tmp_path / "stopped" / "checkpoints" / "step-00000008")
+    train(tiny_training(block="0.03MB", cache="stream"), data=dataset, run=tmp_path / "stopped")
+    assert same_bits(tmp_path / "stopped", tmp_path / "whole")
+    with pytest.raises(RecipeError, match=r"training.block: 0.03MB there, None here"):
+        train(tiny_training(), data=dataset, run=tmp_path / "whole")
+
+
 def test_a_damaged_newest_checkpoint_costs_only_the_steps_since_the_one_before(
     dataset: str, undisturbed: Path, tmp_path: Path
 ) -> None:

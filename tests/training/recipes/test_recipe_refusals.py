@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from training.recipes.training import PATH_KEYS, TrainingRecipe, budget_seconds
+from training.recipes.training import PATH_KEYS, TrainingRecipe, block_bytes, budget_seconds
 
 ORIGIN = {"name": "npt", "variant": "origin"}
 
@@ -39,6 +39,8 @@ ORIGIN = {"name": "npt", "variant": "origin"}
         ({"batch": 8, "ranks": 2, "accumulate": 3}, "batch 8 cannot be shared equally by 2 ranks in 3 parts each"),
         ({"ranks": 2, "launcher": "inline"}, "launcher 'inline' is one process, but ranks is 2; use launcher 'ray'"),
         ({"fewest_ranks": 2}, "fewest_ranks 2 is more than ranks 1"),
+        ({"block": "16"}, "'16' is not a size such as 500MB or 16GB"),
+        ({"network": {"name": "template"}, "block": "1GB"}, "network 'template' knows no block"),
         ({"budget": "10 parsecs"}, "'10 parsecs' is not a time such as 90s, 10min or 2.5h"),
     ],
 )
@@ -67,6 +69,10 @@ def test_what_can_be_meant_is_let_through(values: dict[str, Any]) -> None:
 
 def test_budgets_are_times() -> None:
     assert [budget_seconds(text) for text in ("90s", "10min", "2.5h", " 1 h ")] == [90, 600, 9000, 3600]
+
+
+def test_blocks_are_sizes() -> None:
+    assert [block_bytes(text) for text in ("80kB", "1.5 MB", "16GB", " 2TB ")] == [80e3, 15e5, 16e9, 2e12]
 
 
 def test_paths_are_fields() -> None:

@@ -70,6 +70,7 @@ class TransferTask:
     def _bank(self, ranks: Ranks, device: torch.device) -> VertexBank:
         recipe, identities = self._recipe, self._dataset.identities("training")
         placed: dict[str, Any] = {"device": device, "cache": recipe.cache, "sharers": ranks.here}
+        placed["block"] = self.order.memory(rank=ranks.rank, ranks=ranks.count)
         return open_bank(self._dataset, identities, edge_sum=recipe.edge_sum, **placed)
 
 
