@@ -22,8 +22,9 @@ from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
 from training.inference.orientation import axes_of_both
 from training.inference.transfer import REFINE_WEIGHT
 from workflows.cli.transfer import weights_of
+from workflows.pipeline.console import warn
 from workflows.transfer.job import TransferJob
-from workflows.transfer.run import TransferWork, warn
+from workflows.transfer.run import TransferWork
 
 
 @dataclass(frozen=True)

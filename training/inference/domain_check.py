@@ -24,6 +24,8 @@ from training.tracking.provenance import FILE, Provenance, provenance_of
 if TYPE_CHECKING:
     from datagen.store import Dataset
 
+POOR = "The result may be poor; look at --picture"
+_FEWEST = 72  # vertices: three of each of the 24 parts that people have
 _TIMES_AS_MANY = 10.0  # vertices than training saw
 _PROPORTIONS_BEYOND = 1.5  # times the range of training
 _STRAY_SHARE, _STRAY_TIMES = 0.01, 2.0  # so few vertices that make the box so many times larger
@@ -100,6 +102,7 @@ def remarks(
     both: tuple[Axes, Axes] | None,
     stated: bool,
     seen: Seen | None,
+    doubt: str = "",
 ) -> Iterator[str]:
     """One line for everything about a mesh that its network has not met.
 
@@ -114,10 +117,12 @@ def remarks(
         and whether a person said how. A network that finds by itself how meshes stand needs neither way nor both.
     seen
         What the network saw, None where that is not known.
+    doubt
+        Why the mesh may be no body that a network which finds how it stands knows; by default its misfit says so.
     """
     upright = axes.turned(mesh.vertices)
     if isinstance(axes, Standing):
-        fits, line = axes.misfit <= STRANGE, _about_a_stranger(name, axes)
+        fits, line = not doubt and axes.misfit <= STRANGE, doubt or _about_a_stranger(name, axes)
     elif way is None:
         fits, line = True, ""
     else:
@@ -128,14 +133,16 @@ def remarks(
     if not (fits and isinstance(axes, Standing)):  # what is understood may be of many parts: clothes, hair, eyes
         yield from _about_parts(name, mesh)
     yield from _about_box(name, upright, seen if fits else None)
-    if not isinstance(axes, Standing):  # a network that reads a sample of the surface does not mind
+    if isinstance(axes, Standing):  # a network that reads a sample of the surface does not mind how many there are
+        yield from _about_few(name, upright, seen)
+    else:
         yield from _about_count(name, len(upright), seen)
 
 
 def _about_a_stranger(name: str, found: Standing) -> str:
     return (
         f"{name} is unlike the bodies of training, however it is turned (misfit {found.misfit:.4f}, above "
-        f"{STRANGE}). The result may be poor; look at --picture"
+        f"{STRANGE}). {POOR}"
     )
 
 
@@ -149,13 +156,12 @@ def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, A
     if way.error(axes) > POOR_ERROR:
         return (
             f"{name} comes back from the network as another shape (PMD {way.error(axes):.3f} onto itself): it is "
-            f"unlike the bodies of training, or does not stand {axes}, or is turned about the vertical. The result "
-            "may be poor; look at --picture"
+            f"unlike the bodies of training, or does not stand {axes}, or is turned about the vertical. {POOR}"
         )
     how = "may be turned about the vertical" if way.is_between else f"may not stand {axes}"
     return (
         f"{name} {how}: it comes back from the network better when it is turned otherwise, but no way is certain. "
-        "The result may be poor; look at --picture"
+        f"{POOR}"
     )
 
 
@@ -203,6 +209,12 @@ def _about_count(name: str, count: int, seen: Seen | None) -> Iterator[str]:
             f"{name} has {count:,} vertices, training saw {known}: its surface may come out dented; add --refine, "
             "or train on bodies of about as many"
         )
+
+
+def _about_few(name: str, vertices: Floats, seen: Seen | None) -> Iterator[str]:
+    count, fewest = len(np.unique(vertices, axis=0)), min(_FEWEST, seen.vertices[0] if seen else _FEWEST)
+    if count < fewest:
+        yield f"{name} has {count} vertices, too few to show how a body stands ({fewest} at least). {POOR}"
 
 
 def _strays(vertices: Floats) -> int:

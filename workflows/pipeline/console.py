@@ -122,6 +122,11 @@ def print_text(text: object) -> None:
     print(printable_lines(text), flush=True)
 
 
+def warn(line: object) -> None:
+    """Print one line on standard error."""
+    print(f"warning: {printable(line)}", file=sys.stderr)
+
+
 def print_facts(facts: dict[str, str]) -> None:
     """Two aligned columns."""
     width = max(map(len, facts))

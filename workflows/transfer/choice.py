@@ -1,13 +1,14 @@
 """Which of the weights that come along pose two meshes: those of people, or those of animals."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
+from training.inference.domain_check import POOR
 from training.inference.orientation import Axes
-from training.inference.standing import KNOWN, STRANGE, Standing
+from training.inference.standing import KNOWN, Standing
 from training.inference.transfer import PoseTransfer
 from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
@@ -15,15 +16,21 @@ from workflows.transfer.job import TransferJob
 Pair = tuple[Standing, Standing]
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
+UNDERSTOOD = 0.004
+"""Misfit up to which a mesh is a person or an animal: twice the worst of thirty strange ones (docs/networks.md)."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Weights, their network, and how source and target stand, as the network finds or a person says."""
+    """Weights, their network, and how source and target stand, as the network finds or a person says.
+
+    ``doubts``: of each of the two, why it may be no body at all, or nothing.
+    """
 
     weights: Path
     transfer: PoseTransfer
     standings: Pair
+    doubts: tuple[str, str] = ("", "")
 
     @classmethod
     def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh], load: Load) -> "Chosen":
@@ -69,10 +76,22 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
             f"{job.sources[0]} is {KINDS[source]} and {job.target} is {KINDS[target]}: a pose of the one says nothing "
             "of the other. Give two of a kind; or add --force, to see what comes of it"
         )
-    return every[target or source or "human"]
+    taken = target or source or "human"
+    known = job.target if target else job.sources[0] if source else None
+    reason = f"the weights {taken} are taken, as {f'they know {known}' if known else 'for every such mesh'}. {POOR}"
+    doubts = (
+        "" if source else f"{job.sources[0]} is {_neither(every, 0)}: {reason}",
+        "" if target else f"{job.target} is {_neither(every, 1)}: {reason}",
+    )
+    return replace(every[taken], doubts=doubts)
 
 
 def _kind(every: dict[str, Chosen], place: int) -> str | None:
     """The weights by which a mesh is best understood, if any understands it."""
     misfit, name = min((each.standings[place].misfit, name) for name, each in every.items())
-    return name if misfit <= STRANGE else None
+    return name if misfit <= UNDERSTOOD else None
+
+
+def _neither(every: dict[str, Chosen], place: int) -> str:
+    misfits = ", ".join(f"{name} {each.standings[place].misfit:.4f}" for name, each in every.items())
+    return f"neither {' nor '.join(KINDS.values())} as the weights know them (misfit {misfits}; above {UNDERSTOOD})"

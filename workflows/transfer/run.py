@@ -3,7 +3,6 @@
 import contextlib
 import os
 import shutil
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, storage_errors
-from datagen.common.printable import printable
 from datagen.mesh.files import MeshFile, write_posed
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
@@ -24,7 +22,8 @@ from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
-from workflows.transfer.choice import Load, chosen, standings
+from workflows.pipeline.console import warn
+from workflows.transfer.choice import Load, Pair, chosen, standings
 from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
@@ -34,11 +33,6 @@ if TYPE_CHECKING:
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
 _VOTING_FRAMES = 3  # of a sequence, on how it stands
-
-
-def warn(line: str) -> None:
-    """One line on standard error."""
-    print(f"warning: {printable(line)}", file=sys.stderr)
 
 
 class TransferWork:
@@ -87,7 +81,7 @@ class TransferWork:
         if weights is None:
             found = chosen(job, meshes, force=force, load=load)
             work = cls(job, found.transfer, first=first, target=target, by=found.weights.name, warn=warn)
-            work._take(found.standings, found.weights)
+            work._take(found.standings, found.weights, found.doubts)
             return work
         transfer = (load or PoseTransfer.from_run)(weights, project=job.project)
         work = cls(job, transfer, first=first, target=target, warn=warn)
@@ -115,12 +109,14 @@ class TransferWork:
             ):
                 self._warn(line)
 
-    def _take(self, found: tuple[Standing, Standing], weights: Path) -> None:
+    def _take(self, found: Pair, weights: Path, doubts: tuple[str, str] = ("", "")) -> None:
         """Turn the meshes as they were found to stand; warn of those that the network does not know."""
         self.axes, seen, stated = found, seen_by(weights), self.job.is_told
         meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
-        for (path, mesh), axes in zip(meshes, found, strict=True):
-            for line in remarks(mesh, name=str(path), axes=axes, way=None, both=None, stated=stated, seen=seen):
+        for (path, mesh), axes, doubt in zip(meshes, found, doubts, strict=True):
+            for line in remarks(
+                mesh, name=str(path), axes=axes, way=None, both=None, stated=stated, seen=seen, doubt=doubt
+            ):
                 self._warn(line)
 
     def run(self) -> str:

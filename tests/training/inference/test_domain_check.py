@@ -133,3 +133,18 @@ def test_parts_that_do_not_touch_are_no_matter_where_the_whole_is_understood(mis
     standing = Standing(np.eye(3), misfit)
     said = list(remarks(several, name="A", axes=standing, way=None, both=None, stated=False, seen=None))
     assert any("separate parts" in line and "--target-geometry" in line for line in said) == is_said
+
+
+@pytest.mark.parametrize(
+    ("count", "saw", "is_said"), [(8, None, True), (71, None, True), (72, None, False), (32, (32, 32), False)]
+)
+def test_too_few_vertices_are_no_body_however_well_they_fit(
+    count: int, saw: tuple[int, int] | None, is_said: bool
+) -> None:
+    """Of a box's eight corners a network makes of each what it likes."""
+    places = np.random.default_rng(0).normal(size=(count, 3))
+    mesh = Mesh(np.concatenate([places, places]), np.array([[0, 1, 2]]))  # of a box in a file each corner is three
+    seen = Seen(saw, np.zeros(3), np.ones(3)) if saw else None
+    standing = Standing(np.eye(3), 0.0001)
+    said = list(remarks(mesh, name="A", axes=standing, way=None, both=None, stated=False, seen=seen))
+    assert any(f"A has {count} vertices, too few to show how a body stands" in line for line in said) == is_said

@@ -1,5 +1,6 @@
 """Weights are chosen by which of them understand the meshes, and a person is not posed like an animal unasked."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +42,13 @@ class Understanding:
 
 
 @pytest.fixture
-def choose(monkeypatch: pytest.MonkeyPatch) -> Choose:
+def said() -> list[str]:
+    """What is doubted of source and target by the last choice."""
+    return []
+
+
+@pytest.fixture
+def choose(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> Choose:
     loaded: list[str] = []
 
     def from_run(weights: Path) -> Understanding:
@@ -56,6 +63,7 @@ def choose(monkeypatch: pytest.MonkeyPatch) -> Choose:
         found = chosen(job, (source, target), force=force)
         assert isinstance(found.transfer, Understanding) and found.transfer.name == found.weights.name
         assert loaded == (["human"] if source is target is PERSON else ["human", "animals"])
+        said[:] = found.doubts
         return found.weights.name, [each.misfit for each in found.standings]
 
     return call
@@ -77,6 +85,20 @@ def test_by_the_mesh_that_is_understood(
     choose: Choose, source: Mesh, target: Mesh, weights: str, misfits: list[float], is_told: bool
 ) -> None:
     assert choose(source, target, is_told=is_told) == (weights, misfits)
+
+
+def test_what_no_weights_know_is_told_of_as_nothing_else(choose: Choose, said: list[str]) -> None:
+    neither = r"is neither a person nor an animal on four legs .* \(misfit human 0\.1000, animals 0\.1000; above .*\)"
+    for source, target, reasons in (
+        (PERSON, PERSON, ("", "")),
+        (ANIMAL, PERSON, ("", "")),
+        (BOX, ANIMAL, ("animals are taken, as they know b.obj", "")),
+        (PERSON, BOX, ("", "human are taken, as they know a.obj")),
+        (BOX, BOX, ("human are taken, as for every such mesh",) * 2),
+    ):
+        choose(source, target, force=True)
+        for name, doubt, reason in zip(("a.obj", "b.obj"), said, reasons, strict=True):
+            assert re.match(f"{name} {neither}: the weights {reason}", doubt) if reason else not doubt
 
 
 def test_one_of_each_is_refused_but_when_it_is_forced(choose: Choose) -> None:
