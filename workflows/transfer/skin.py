@@ -20,10 +20,12 @@ from datagen.poses import Poses
 from training.avatar.body import CanonicalBody, canonical_body
 from training.avatar.diffusion import thin_plate
 from training.avatar.solid import Solid
+from workflows.pipeline.console import warn
 from workflows.recipe.loader import WorkflowRecipe, change_recipe, load_recipe
 
 _OFFSET = 0.006  # of the body's largest extent: a centimetre of a person
 _FAR = 0.25  # of it: a mesh the half of which is further from the skin does not lie around the body
+_APART, _TENTH = 0.1, 0.9  # of it: a mesh a tenth of which is further from the skin may stand otherwise than the body
 
 
 @dataclass(frozen=True)
@@ -119,11 +121,19 @@ def _skinned(mesh: MeshFile, body: CanonicalBody, out: Path) -> list[str]:
 
 
 def _require_around(mesh: MeshFile, body: CanonicalBody) -> None:
+    """Refuse a mesh that does not lie around the body, and warn of one that may stand otherwise."""
     away = np.abs(Solid(body.vertices, body.faces).depth(mesh.mesh.vertices))
-    if np.median(away) > _FAR * _extent(body):
+    near, far = np.quantile(away, (0.5, _TENTH))
+    if near > _FAR * _extent(body):
         raise MeshError(
             f"{mesh.path} does not lie around the body at rest: it spans {_spans(mesh.mesh.vertices)}, the body "
             f"{_spans(body.vertices)} (metres, Y up, facing +Z). Bring it there; --body-mesh FILE writes the body"
+        )
+    if far > _APART * _extent(body):
+        warn(
+            f"a tenth of {mesh.path} is {100 * far:.0f} cm or more from the body at rest, half within "
+            f"{100 * near:.0f} cm: if it stands in another pose, it will move wrongly. Bring it to rest, people to the "
+            "T-pose; --body-mesh FILE writes the body"
         )
 
 

@@ -1,5 +1,6 @@
 """``dsffnet skin``: what comes out moves as the field around the body says, and opens as a rigged character."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,26 @@ def test_a_rigged_file_is_a_body_too_and_what_is_written_is_one(sock: Path, tmp_
     run(sock, "--body", tmp_path / "sock.glb", "--out", tmp_path / "again.glb")
     first, again = (SkinnedFile(tmp_path / f"{name}.glb") for name in ("sock", "again"))
     assert again.names == first.names and np.abs(bent(again, 50) - bent(first, 50)).max() < 0.01
+
+
+def test_a_mesh_in_another_pose_is_warned_of_with_a_measure(
+    sock: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--body", "leg", "--identity", "2", "--out", tmp_path / "sock.glb")
+    run(sock, *words)
+    assert capfd.readouterr() == ("", ""), "neither a warning nor a word of Warp's"
+    model, recipe = load_body(LegBody()), DatasetRecipe(body=LegBody())
+    rotations = np.zeros((1, len(JOINTS), 3))
+    rotations[0, JOINTS.index("left_knee"), 0] = np.radians(60)
+    who = identity_parameters(recipe, model, 2)
+    leg = model.vertices(who, Poses(JOINTS, PARENTS, rotations))[0]
+    save_mesh(Mesh(leg.astype(np.float32), model.faces(who)), tmp_path / "bent.obj")
+    run(tmp_path / "bent.obj", *words)
+    found = re.search(
+        r"warning: a tenth of .*bent\.obj is (\d+) cm or more from the body at rest, half within (\d+) cm",
+        capfd.readouterr().err,
+    )
+    assert found and int(found[1]) > 5 > int(found[2]) - 5
 
 
 @pytest.mark.parametrize(
