@@ -28,13 +28,11 @@ _OF_THE_PAGE = {
 }
 """What messages say that a command line is to do, and what is done here."""
 _OPTION = re.compile(r"(?<!\S)--([a-z]+)(=?)")
-_WORDS = {
-    "PMD": "point-wise mesh distance: mean over vertices and coordinates of (result - truth)², both in boxes that are "
-    "centred and divided by half the longest edge of the truth's; 0 is the truth itself",
-    "misfit": "how badly the weights understand a mesh: what is left where each part is its rest, turned, a mean of "
-    "squares in the mesh' box; 0.003 or less of bodies that they know well",
-}
-"""What is said on the page, and what it means."""
+_PMD = "PMD: mean square of {} in the truth's box, boxes centred alike"
+_MISFIT = (
+    "*misfit*: how badly the weights understand a mesh: what is left where each part is its rest, turned, a mean of "
+    "squares in the mesh' box. Bodies like those of training have 0.002 or less."
+)
 _BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
 
 
@@ -66,22 +64,27 @@ def about(outcome: Outcome, folder: Path) -> str:
     vertices = f"{len(outcome.file.mesh.vertices):,} vertices"
     frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
     lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
-    lines += [f"⚠ {plain(warning, folder)}" for warning in outcome.warnings]
-    said = " ".join([*lines, *(label(outcome, frame) for frame in outcome.frames[:1])])
-    return "\n\n".join([*lines, *(f"*{word}*: {means}" for word, means in _WORDS.items() if word in said)])
+    warnings = [f"⚠ {plain(warning, folder)}" for warning in outcome.warnings]
+    words = [_MISFIT] if any("(misfit " in warning for warning in warnings) else []
+    return "\n\n".join([*lines, *warnings, *words])
 
 
 def legend(outcome: Outcome, frame: Posed, worst: float, *, shown: bool) -> str:
-    """The bar of colours, and what PMD is."""
-    if not shown:
-        return ""
+    """The bar of colours, if it is ``shown``, and what PMD is."""
     if frame.pmd is None:
         words = outcome.no_truth or (_DRAPED if outcome.asked.needs_draping else _UNKNOWN)
-        return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>'
+        return _small(words) if shown else ""
+    if not shown:
+        return _small(_PMD.format("the distance of each vertex to the truth"))
     ticks = "".join(f"<span>{100 * worst * share:.1f}</span>" for share in (0, 0.5, 1))
     return (
         '<div style="margin:4px 14px 10px;font-size:12px;color:#5d6676">'
         f'<div style="height:9px;border-radius:3px;background:linear-gradient(90deg,{_BAR})"></div>'
         f'<div style="display:flex;justify-content:space-between">{ticks}</div>'
-        "<div>distance of each vertex to the truth, in cm (the last: 99th percentile and above)</div></div>"
+        "<div>distance of each vertex to the truth, in cm (the last: 99th percentile and above); "
+        f"{_PMD.format('it')}</div></div>"
     )
+
+
+def _small(words: str) -> str:
+    return f'<p style="margin:4px 14px 8px;font-size:12px;color:#5d6676">{escape(words)}</p>'

@@ -79,8 +79,8 @@ class Page:
         """Show the frame that is done; the others are played."""
         self._progress.visible = len(outcome.frames) < outcome.count
         self._progress.value = 100 * len(outcome.frames) / outcome.count
-        self._offer_downloads(True)
         if len(outcome.frames) == 1:
+            self._offer_downloads(True)
             self._draw(outcome, outcome.frames[0])
             self._stage.arrange()
         self._status.content = about(outcome, self.session.folder)

@@ -221,11 +221,15 @@ def test_words_are_explained_where_they_are_said(session: Session, view: Seen, l
     outcome = session.outcome
     assert outcome is not None
     outcome.warnings = []
-    assert not any(word in about(outcome, session.folder) for word in ("misfit", "PMD"))
+    assert "misfit" not in about(outcome, session.folder)
     outcome.warnings = ["leg.obj is unlike the bodies of training (misfit 0.02)"]
     assert "*misfit*: how badly the weights understand a mesh" in about(outcome, session.folder)
-    outcome.frames[0] = replace(outcome.frames[0], pmd=1e-4)
-    assert "*PMD*: point-wise mesh distance" in about(outcome, session.folder)
+    assert not legend(outcome, outcome.frames[0], 1.0, shown=False)
+    known = replace(outcome.frames[0], pmd=1e-4)
+    for shown in (False, True):
+        assert ("PMD: mean square of it" if shown else "PMD: mean square of the distance of each vertex") in legend(
+            outcome, known, 1.0, shown=shown
+        )
 
 
 def test_a_broken_file_is_refused_in_one_line_and_the_last_one_stays(session: Session, legs: list[Path]) -> None:
