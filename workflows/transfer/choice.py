@@ -16,8 +16,8 @@ from workflows.transfer.job import TransferJob
 Pair = tuple[Standing, Standing]
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
-UNDERSTOOD = 0.004
-"""Misfit up to which a mesh is a person or an animal: twice the worst of thirty strange ones (docs/networks.md)."""
+_UNDERSTOOD = {"human": 0.008, "animals": 0.004}
+"""Misfit by the weights up to which a mesh is what they know; people in dresses have 0.007 (docs/networks.md)."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,12 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
 
 def _kind(every: dict[str, Chosen], place: int) -> str | None:
     """The weights by which a mesh is best understood, if any understands it."""
-    misfit, name = min((each.standings[place].misfit, name) for name, each in every.items())
-    return name if misfit <= UNDERSTOOD else None
+    misfits = {name: each.standings[place].misfit for name, each in every.items()}
+    return min((name for name in every if misfits[name] <= _UNDERSTOOD[name]), key=misfits.__getitem__, default=None)
 
 
 def _neither(every: dict[str, Chosen], place: int) -> str:
-    misfits = ", ".join(f"{name} {each.standings[place].misfit:.4f}" for name, each in every.items())
-    return f"neither {' nor '.join(KINDS.values())} as the weights know them (misfit {misfits}; above {UNDERSTOOD})"
+    misfits = "; ".join(
+        f"{name} {each.standings[place].misfit:.4f}, above {_UNDERSTOOD[name]}" for name, each in every.items()
+    )
+    return f"neither {' nor '.join(KINDS.values())} as the weights know them (misfit {misfits})"
