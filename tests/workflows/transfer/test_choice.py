@@ -88,9 +88,7 @@ def test_by_the_mesh_that_is_understood(
 
 
 def test_what_no_weights_know_is_told_of_as_nothing_else(choose: Choose, said: list[str]) -> None:
-    neither = (
-        r"is neither a person nor an animal on .* \(misfit human 0\.1000, above 0\.008; animals .*, above 0\.004\)"
-    )
+    neither = r"is neither a person nor an animal .* \(misfit human 0\.1000, above 0\.008; animals .*, above 0\.004\)"
     for source, target, reasons in (
         (PERSON, PERSON, ("", "")),
         (ANIMAL, PERSON, ("", "")),
