@@ -74,7 +74,8 @@ class Options:
 def posed(source: Any, target: Any, options: Options) -> PosedMesh:
     """Return the target in the pose of the source, by the work of ``dsffnet transfer``."""
     with _in_words_of_python():
-        return _posed(source, target, options)
+        found = _posed(source, target, options)
+    return found
 
 
 def _posed(source: Any, target: Any, options: Options) -> PosedMesh:

@@ -74,10 +74,12 @@ def write_animals(folder: Path) -> list[Path]:
     BodyError, StorageError
         As :func:`animal_files`; the folder cannot be written to.
     """
-    files = animal_files()
+    copies = {file: folder / file.name for file in animal_files()}
     with storage_errors(f"the animals to {folder}", advice="Choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
-        return [Path(shutil.copyfile(file, folder / file.name)) for file in files]
+        for file, copy in copies.items():
+            shutil.copyfile(file, copy)
+    return list(copies.values())
 
 
 @cache
