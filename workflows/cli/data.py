@@ -294,7 +294,7 @@ def convert_body_command(options: argparse.Namespace) -> None:
 
 
 def stand_in_command(options: argparse.Namespace) -> None:
-    """Write a licence-free model in the layout of SMPL, SMPL-H, SMPL-X or SMAL, or CC0 animals, to try things out.
+    """Write a licence-free model in the layout of SMPL, -H, -X or SMAL, or CC0 animals, to try things out.
 
     examples:
       dsffnet stand-in smpl --out standin.npz

@@ -22,7 +22,7 @@ class PageError(DsffnetError):
 
 
 def ui_command(options: argparse.Namespace) -> None:
-    """Show a folder's MLflow store in the browser, until Ctrl-C or the end of the shell or make that started this.
+    """Show a folder's MLflow store in the browser, until Ctrl-C or the end of what started this.
 
     examples:
       dsffnet ui
