@@ -97,6 +97,11 @@ def process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
     dist.destroy_process_group()
 
 
+def is_of_the_group(error: BaseException) -> bool:
+    """Whether an error is the process group's: of Gloo, of NCCL, or of the store where the ranks meet."""
+    return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error).lower())
+
+
 @contextlib.contextmanager
 def alone_in(run: Path, ranks: Ranks) -> Iterator[None]:
     """One training a run: rank 0 holds a lock that the operating system drops if the process dies.

@@ -7,6 +7,7 @@ and friends.
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import time
@@ -20,16 +21,20 @@ import torch
 from pydantic import Field, TypeAdapter
 from typing_extensions import TypedDict
 
-from datagen.common.errors import DsffnetError, TrainingError, TrainingStopped
+from datagen.common.errors import DsffnetError, TrainingError, TrainingStopped, reason_of
 from datagen.common.files import read_json_if_whole, read_within, set_aside, write_atomically
 from datagen.common.printable import printable
-from training.engine.distributed import STOP_FILE, Ranks, device_of
+from training.engine.distributed import STOP_FILE, Ranks, device_of, is_of_the_group
 from training.engine.trainer import train
 from training.recipes.files import recipe_in
 from training.recipes.training import TrainingRecipe
 
 log = logging.getLogger(__name__)
 _RESTARTS, _FAILURE, _MARK = 3, "failure.json", ".launch"
+_LOST = (
+    "another rank has ended, or its host cannot be reached ({}). Run the same command again on every host: it resumes "
+    "from the newest checkpoint"
+)
 _ASK_SECONDS = 60.0  # that a cluster has to say whether its torch uses its GPUs
 
 
@@ -263,6 +268,12 @@ def main() -> None:
     except (DsffnetError, OSError) as error:
         print(f"error: {printable(error)}", file=sys.stderr)
         status = getattr(error, "exit_status", 1)
+    except RuntimeError as error:
+        if not is_of_the_group(error):
+            raise
+        reason = re.sub(r"^\[[^]]*\] ", "", reason_of(error))  # the line of Gloo's source
+        print(f"error: {_LOST.format(printable(reason))}", file=sys.stderr)
+        status = 1
     sys.stdout.flush()
     sys.stderr.flush()
     # All is on the disk. Taking the interpreter down can abort (-6), after a clean end too: what is left of a process

@@ -139,8 +139,9 @@ def test_sigkill_of_a_rank_ends_the_other_and_a_restart_ends_equal(dataset: str,
     while not list((killed / "checkpoints").glob("step-*")):
         time.sleep(0.01)
     started[1].send_signal(signal.SIGKILL)
-    statuses = [status for status, _ in finish(started, timeout=60)]
-    assert statuses[1] == -signal.SIGKILL and statuses[0] != 0
+    (status, said), (of_the_killed, _) = finish(started, timeout=60)
+    assert of_the_killed == -signal.SIGKILL and status == 1 and "Traceback" not in said
+    assert said.splitlines()[-1].startswith("error: another rank has ended") and "same command again" in said
     assert [status for status, _ in finish(start_ranks(recipe, data=dataset, run=killed, count=2))] == [0, 0]
     assert same_bits(killed, whole)
 
