@@ -25,7 +25,7 @@ done; \
     "Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 endef
 
-.PHONY: help install run test test-cluster test-slow fuzz lint docs bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
+.PHONY: help install run test test-cluster test-hosts test-slow fuzz lint docs bench bench-generation bench-networks bench-input bench-training bench-transfer bench-gpu ui constraints clean
 .DEFAULT_GOAL := help
 
 help: ## this list
@@ -41,6 +41,9 @@ test: $(READY) ## the test suite, by as many processes as there are CPUs, at mos
 
 test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a job submitted to them
 	@$(BIN)/python -m pytest -m cluster $(ARGS)
+
+test-hosts: $(READY) ## Ray nodes, MLflow, S3 on hosts of their own (namespaces, as root), faults between them: half an hour
+	@$(BIN)/python -m pytest -m hosts $(ARGS)
 
 test-slow: $(READY) ## every rig and topology of Anny, the real animals (fetched once), torch.compile: some ten minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
