@@ -4,7 +4,9 @@ DSFFNet at the quickstart's widths and at the paper's, batch 8, on a grid of pro
 the quickstart's bodies (615) and SMPL (6,890). A streamed bank may hold a quarter of the meshes. A step is input,
 forward, both losses, backward and AdamW, and ends when its loss is known, as the trainer's does. ``wait`` is the time
 in which the step stands still for its batch; a thread that reads ahead may also slow the rest down, so the step is
-compared with that of meshes in memory, too. Every cache runs in turn, in blocks.
+compared with that of meshes in memory, too. Every way runs in turn. ``blocks`` is a stream of triples in blocks of
+shards. ``--s3 30``: the data lie on an S3 server that takes 30 ms more for a request, and the requests of a whole epoch
+are counted (``--poses 1200``: in shards of 100 meshes, as the quickstart's).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -25,15 +27,19 @@ from torch import nn
 from datagen.generate import generate
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset, open_dataset
-from training.data.triples import TripleOrder
+from tests.support.damage.object_store import BUCKET, Proxy, proxied, s3_server
+from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.data.vertex_layout import Layout
 from training.networks.dsffnet import DSFFNet
 from training.objectives.losses import transfer_loss
+from training.recipes.training import TrainingRecipe
 
 GOAL = 0.02
 BATCH = 8
-CACHES = ("device", "stream")
+WAYS = ("device", "stream", "blocks")
+_COLUMNS = 12
+"""Of shards, along the poses."""
 
 
 class Case(NamedTuple):
@@ -62,7 +68,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--poses", type=int, default=150, help="of each of 8 identities")
-    parser.add_argument("--rounds", type=int, default=2, help="blocks of each cache")
+    parser.add_argument("--rounds", type=int, default=2, help="turns of each way")
+    parser.add_argument("--s3", type=float, metavar="MS", help="data on an S3 server that takes so much longer")
     parser.add_argument("--quick", action="store_true", help="the small case only, a few steps")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -70,35 +77,47 @@ def main() -> None:
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {options.threads} threads"
     print(f"torch {torch.__version__}, {name}, batch {BATCH}; goal: wait under {GOAL:.0%} of the step")
     for title, case in list(CASES.items())[: 1 if options.quick else None]:
-        with tempfile.TemporaryDirectory() as folder:
-            show(title, measure(case, Path(folder), device, options))
+        with tempfile.TemporaryDirectory() as folder, ExitStack() as around:
+            dataset, proxy = legs(case, Path(folder), options, around)
+            show(title, measure(case, dataset, device, options))
+            if proxy:
+                show_requests(dataset, proxy)
 
 
 def show(title: str, times: dict[str, Times]) -> None:
     """One case's table; medians of steps, and the share over all steps together."""
-    print(f"\n{title}\n  {'cache':8}{'step ms':>10}{'wait ms':>10}{'longest':>10}{'share':>8}{'step / device':>15}")
+    print(f"\n{title}\n  {'way':8}{'step ms':>10}{'wait ms':>10}{'longest':>10}{'share':>8}{'step / device':>15}")
     usual = statistics.median(times["device"].step)
-    for cache, (wait, step) in times.items():
+    for way, (wait, step) in times.items():
         middle, share = statistics.median(step), sum(wait) / sum(step)
         print(
-            f"  {cache:8}{1e3 * middle:10.1f}{1e3 * statistics.median(wait):10.3f}{1e3 * max(wait):10.2f}"
+            f"  {way:8}{1e3 * middle:10.1f}{1e3 * statistics.median(wait):10.3f}{1e3 * max(wait):10.2f}"
             f"{share:8.2%}{middle / usual:15.2f}   {'' if share < GOAL else 'over the goal'}"
         )
 
 
-def measure(case: Case, folder: Path, device: torch.device, options: argparse.Namespace) -> dict[str, Times]:
-    """Seconds of every step and of its wait, by cache."""
-    dataset = legs(case, folder, options.poses)
+def show_requests(dataset: Dataset, proxy: Proxy) -> None:
+    """Requests that an epoch of triples makes, without learning."""
+    for way in WAYS[1:]:
+        before, order = len(proxy.requests("/vertices/c/")), order_by(way, dataset)
+        with closing(bank_of(way, dataset, torch.device("cpu"))) as bank:
+            for (triples,) in islice(bank.prefetch(order.batches(first_step=0)), order.steps_per_epoch):
+                bank.batch(triples)
+        asked = len(proxy.requests("/vertices/c/")) - before
+        print(f"  {way:8}{asked:,} requests for {len(dataset.sizes)} shards: {asked / len(dataset.sizes):.2f} each")
+
+
+def measure(case: Case, dataset: Dataset, device: torch.device, options: argparse.Namespace) -> dict[str, Times]:
+    """Seconds of every step and of its wait, by way."""
     torch.manual_seed(0)
     network = DSFFNet(encoder_widths=case.encoder, decoder_widths=case.decoder).to(device)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-6)
     steps = 10 if options.quick else case.steps if device.type == "cpu" else 150
-    order = TripleOrder(dataset.identities("training"), dataset.grid.poses("seen"), batch=BATCH, seed=0)
-    banks = {cache: bank_of(cache, dataset, device) for cache in CACHES}
-    times = {cache: Times([], []) for cache in banks}
+    banks = {way: bank_of(way, dataset, device) for way in WAYS}
+    times = {way: Times([], []) for way in banks}
     for turn in range(options.rounds):
-        for cache, bank in banks.items():
-            block(bank, order, turn * steps, steps, (network, optimiser), times[cache])
+        for way, bank in banks.items():
+            block(bank, order_by(way, dataset), turn * steps, steps, (network, optimiser), times[way])
     for bank in banks.values():
         bank.close()
     return times
@@ -112,7 +131,7 @@ def block(
     learning: tuple[nn.Module, torch.optim.Optimizer],
     times: Times,
 ) -> None:
-    """Some steps of one cache; the first is for warming up."""
+    """Some steps of one way; the first is for warming up."""
     with closing(bank.prefetch(order.batches(first_step=first))) as shares:  # type: ignore[type-var]
         for number, (wait, step) in enumerate(islice(timed(bank, shares, *learning), steps + 1)):
             if number:
@@ -138,24 +157,41 @@ def timed(
         yield waited, time.perf_counter() - began
 
 
-def bank_of(cache: str, dataset: Dataset, device: torch.device) -> VertexBank:
-    """A bank of the training meshes; a streamed one holds a quarter of them."""
-    identities = dataset.identities("training")
-    memory = Layout(dataset, identities).bytes // 4
-    return open_bank(dataset, identities, device=device, cache=cache, memory=memory)  # type: ignore[arg-type]
+def quarter(dataset: Dataset) -> int:
+    """Bytes of a quarter of the training meshes, which a streamed bank holds."""
+    return Layout(dataset, dataset.identities("training")).bytes // 4
 
 
-def legs(case: Case, folder: Path, poses: int) -> Dataset:
-    """Legs of 8 identities, all for training."""
+def order_by(way: str, dataset: Dataset) -> TripleOrder:
+    """The order of triples of one way."""
+    block = f"{quarter(dataset) / 1e3:.0f}kB" if way == "blocks" else None
+    return order_of(TrainingRecipe(batch=BATCH, block=block), dataset)
+
+
+def bank_of(way: str, dataset: Dataset, device: torch.device) -> VertexBank:
+    """A bank of the training meshes."""
+    identities, memory = dataset.identities("training"), quarter(dataset)
+    placed = {"device": device, "memory": memory, "block": order_by(way, dataset).memory()}
+    return open_bank(dataset, identities, cache="device" if way == "device" else "stream", **placed)  # type: ignore[arg-type]
+
+
+def legs(case: Case, folder: Path, options: argparse.Namespace, around: ExitStack) -> tuple[Dataset, Proxy | None]:
+    """Legs of 8 identities, all for training, in a folder, or on a server behind a proxy while ``around`` is open."""
     recipe = DatasetRecipe.model_validate(
         {
             "body": {"family": "leg", "rings": case.rings, "segments": case.segments},
             "identities": {"training": 8, "evaluation": 0},
-            "poses": {"seen": poses, "unseen": 0},
+            "poses": {"seen": options.poses, "unseen": 0},
             "triples": {"count": 0},
+            "store": {"poses_per_shard": -(-options.poses // _COLUMNS)},
         }
     )
-    return open_dataset(generate(recipe, str(folder / "legs.zarr")).url)
+    if options.s3 is None:
+        return open_dataset(generate(recipe, str(folder / "legs.zarr")).url), None
+    around.enter_context(s3_server())
+    url = generate(recipe, f"{BUCKET}/legs.zarr").url
+    proxy = around.enter_context(proxied(folder / "requests", delay=options.s3 / 1e3))
+    return open_dataset(url), proxy
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ _T = TypeVar("_T")
 PATIENCE = 60.0
 """Seconds for which a remote store that does not answer is asked again."""
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 8.0
+_LISTED_FROM = 32  # sizes; a listing costs as much as a dozen requests for one
 S3_OPTIONS: dict[str, Any] = {
     "config_kwargs": {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 0}}
 }
@@ -63,7 +64,13 @@ class RemoteObjects(FsspecStore):
         return found
 
     def sizes(self, paths: list[str]) -> dict[str, int]:
-        """Size of each path that exists, asked for concurrently."""
+        """Size of each path that exists: asked for concurrently, or listed where many are asked for."""
+        for path in paths:
+            require_member(path)
+        if len(paths) >= _LISTED_FROM:
+            self.fs.invalidate_cache()
+            listed = sync(self._patiently(self._listed_sizes))
+            return {path: listed[path] for path in paths if path in listed}
 
         async def size(path: str) -> tuple[str, int] | None:
             try:
@@ -75,6 +82,12 @@ class RemoteObjects(FsspecStore):
             return list(await asyncio.gather(*(size(path) for path in paths)))
 
         return dict(found for found in sync(all_sizes()) if found is not None)
+
+    async def _listed_sizes(self) -> dict[str, int]:
+        """Size of every object, some thousand by a request."""
+        found, root = await self.fs._find(self.path, detail=True), f"{self.path.strip('/')}/"
+        objects = ((path.lstrip("/").removeprefix(root), about) for path, about in found.items())
+        return {path: int(about["size"]) for path, about in objects if about["type"] == "file"}
 
     def names(self) -> list[str]:
         """Names of what lies directly at the store's place."""

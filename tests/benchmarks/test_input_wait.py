@@ -16,4 +16,4 @@ def test_the_benchmark_of_input_waiting_runs() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert all(f"  {cache}" in done.stdout for cache in ("device", "stream")) and "%" in done.stdout
+    assert all(f"  {way}" in done.stdout for way in ("device", "stream", "blocks")) and "%" in done.stdout

@@ -13,7 +13,7 @@ from datagen.common.errors import DatasetError
 from datagen.mesh.geometry import edges_of
 from datagen.store import Dataset
 from training.data.triples import Triples
-from training.data.vertex_layout import normalised
+from training.data.vertex_layout import normalised, read_each
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.losses import INCIDENCES, PackedEdges, incidence_of, join_incidences, loss_edges
 from training.objectives.parts import Posed
@@ -183,6 +183,7 @@ def _read(
             "Use a dataset of one body"
         )
     meshes = np.zeros((len(counts), counts.max(), 3), np.float32)
-    for mesh, identity, pose, count in zip(meshes, identities, poses, counts, strict=True):
-        mesh[:count] = normalised(dataset.vertices(int(identity), [int(pose)]))[0]
+    read = read_each(dataset, identities.tolist(), poses.tolist())
+    for mesh, vertices in zip(meshes, read, strict=True):
+        mesh[: len(vertices)] = normalised(vertices[None])[0]
     return torch.from_numpy(meshes), counts_of(counts)

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from datagen.common.errors import RecipeError
 from datagen.common.resources import bytes_text
-from training.data.vertex_layout import Floats, Layout
+from datagen.store.objects import is_local
+from training.data.vertex_layout import Floats, Layout, readers_of
 
-_LOCAL_READERS, _REMOTE_READERS = 2, 16  # a remote store answers in some 30 ms, whatever is asked
 _LOCAL_REQUEST_BYTES, _REMOTE_REQUEST_BYTES = 2**18, 2**21  # that are read and decoded in the time of one more request
 _FEWEST_SLOTS = 64
 
@@ -41,10 +41,8 @@ class StreamedMeshes:
         self._held = torch.from_numpy(np.zeros((self.slots, self.rows, 3), np.float32))  # takes memory as it fills
         self._slot: OrderedDict[int, int] = OrderedDict()
         self._guard = threading.RLock()
-        remote = "://" in layout.dataset.url.removeprefix("file://")
-        self._request_bytes = _REMOTE_REQUEST_BYTES if remote else _LOCAL_REQUEST_BYTES
-        readers = _REMOTE_READERS if remote else _LOCAL_READERS
-        self._readers = ThreadPoolExecutor(readers, thread_name_prefix="stream")
+        self._request_bytes = _LOCAL_REQUEST_BYTES if is_local(layout.dataset.url) else _REMOTE_REQUEST_BYTES
+        self._readers = ThreadPoolExecutor(readers_of(layout.dataset), thread_name_prefix="stream")
 
     @property
     def together(self) -> int:

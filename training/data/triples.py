@@ -233,6 +233,6 @@ class BlockOrder(TripleOrder):
         """Triples tile by tile, in the order of the batches: put off, and dealt to the lanes."""
         steps, width = self.steps_per_epoch, self.batch // self.lanes
         lanes = np.arange(steps * self.batch).reshape(self.lanes, steps * width)
-        order = np.argsort(np.arange(steps * width) + random.uniform(0, self.reach, lanes.shape), axis=1)
+        order = np.argsort(np.arange(steps * width) + random.uniform(0, self.reach, lanes.shape), axis=1, kind="stable")
         dealt = np.take_along_axis(lanes, order, axis=1).reshape(self.lanes, steps, width).swapaxes(0, 1).ravel()
         return np.concatenate([triples[dealt], triples[len(dealt) :]])

@@ -13,12 +13,14 @@ from torch import Tensor
 from datagen.grid import HOLE, SPLITS, Split
 from datagen.mesh.geometry import Box, bounds
 from datagen.store import Dataset
+from datagen.store.objects import is_local
 
 Numbers = NDArray[np.integer]
 Floats = NDArray[np.float32]
 
 _CHUNK_BYTES = 2**25  # decoded at a time by one thread
 _MOST_THREADS = 8
+_LOCAL_READERS, _REMOTE_READERS = 2, 16  # a remote store answers in some 30 ms, whatever is asked
 
 
 def normalised(meshes: Floats) -> Floats:
@@ -28,6 +30,23 @@ def normalised(meshes: Floats) -> Floats:
     """
     low, high = bounds(meshes)
     return Box((low + high) / 2, (high - low).max(axis=-1) / 2).normalise(meshes).astype(np.float32, copy=False)
+
+
+def readers_of(dataset: Dataset) -> int:
+    """How many threads read from where a dataset lies."""
+    return _LOCAL_READERS if is_local(dataset.url) else _REMOTE_READERS
+
+
+def read_each(dataset: Dataset, identities: Sequence[int], poses: Sequence[int]) -> list[Floats]:
+    """Vertices [vertex, 3] in metres of each mesh (identity, pose), several read at a time.
+
+    Raises
+    ------
+    DatasetError
+        A shard is missing or damaged.
+    """
+    with ThreadPoolExecutor(readers_of(dataset), thread_name_prefix="meshes") as pool:
+        return list(pool.map(dataset.vertices, identities, poses))
 
 
 class Layout:
@@ -170,7 +189,7 @@ class Layout:
 def decode(layout: Layout, device: torch.device, *, sharers: int = 1) -> Tensor:
     """Return all normalised vertices [vertex, 3] of a layout, in a device's memory.
 
-    A few threads read, the machine's processors being divided among ``sharers`` processes.
+    A few threads read: from a disk as many as the machine has processors for each of ``sharers`` processes.
 
     Raises
     ------
@@ -183,7 +202,8 @@ def decode(layout: Layout, device: torch.device, *, sharers: int = 1) -> Tensor:
         start, read = int(layout.starts[meshes[0]]), layout.read(meshes).reshape(-1, 3)
         vertices[start : start + len(read)] = torch.from_numpy(read).to(device)
 
-    threads = max(1, min(_MOST_THREADS, (os.cpu_count() or 1) // sharers))
+    processors = (os.cpu_count() or 1) // sharers if is_local(layout.dataset.url) else _MOST_THREADS
+    threads = max(1, min(_MOST_THREADS, processors))
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         futures = [pool.submit(one, meshes) for meshes in layout.chunks()]
         try:

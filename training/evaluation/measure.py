@@ -23,6 +23,7 @@ from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.mesh.rig import rest_vertices, skinned, world_rotations
 from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
+from training.data.vertex_layout import read_each
 from training.evaluation.results import Dressed, Row, Score
 from training.inference.predict import load_trained, predict, surfaces_of, takes_surfaces
 from training.inference.projection import OntoParts
@@ -141,7 +142,8 @@ def _groups(dataset: Dataset, triples: NDArray[np.integer]) -> list[_Group]:
 
 def _group(dataset: Dataset, triples: NDArray[np.integer], identity: int) -> _Group:
     places, faces = np.flatnonzero(triples[:, 2] == identity).tolist(), dataset.faces(identity)
-    metres = [float(bounding_box(dataset.vertices(identity, int(triples[place, 1]))).half) for place in places]
+    truths = read_each(dataset, [identity] * len(places), triples[places, 1].tolist())
+    metres = [float(bounding_box(vertices).half) for vertices in truths]
     edges, triangles = torch.from_numpy(edges_of(faces)), torch.from_numpy(faces).long()
     lengths, part = torch.tensor(metres, dtype=torch.float64), dataset.part(identity)
     is_garment = None if part is None else torch.from_numpy(part > 0)

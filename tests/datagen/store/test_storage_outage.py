@@ -1,16 +1,11 @@
 """An object store that does not answer: asked again for a stated time, then one line; what passes leaves no trace."""
 
 import errno
-import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from http.client import HTTPConnection
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
-from threading import Thread
 from typing import Any
 from uuid import uuid4
 
@@ -22,10 +17,10 @@ from datagen import generate as generation
 from datagen.common.errors import DatasetError, StorageError, UnsafeFileError
 from datagen.generate import generate, inline
 from datagen.store import open_dataset, remote_objects
-from datagen.store.objects import list_objects, read_bytes, write_bytes
+from datagen.store.objects import list_objects, read_bytes, stored_sizes, write_bytes
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
-from tests.support.ranks import free_port
+from tests.support.damage.object_store import BUCKET, proxied, s3_server
 from tests.support.recipes import tiny_dataset
 from training.data.vertex_bank import open_bank
 from workflows.cli.main import main
@@ -135,122 +130,66 @@ def test_an_object_that_is_longer_than_it_can_be_is_not_read(url: str) -> None:
     assert [fault.path for fault in find_faults(url)] == [SHARD]
 
 
+def test_sizes_are_listed_where_many_are_asked_for(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    generate(tiny_dataset(), url)
+    group = open_group(url)
+    paths = [*list_objects(group), "grid/training/0/vertices/c/9/9/0/0"]
+    found = []
+    for least in (1, 10**9):
+        monkeypatch.setattr(remote_objects, "_LISTED_FROM", least)
+        found.append(stored_sizes(group, paths))
+    assert found[0] == found[1] and list(found[0]) == paths[:-1]
+
+
 # A real S3 API from here on.
 
 
-class _Proxy(BaseHTTPRequestHandler):
-    """Passes requests on to a server; every fifth is answered 503, every seventh by closing the connection."""
-
-    protocol_version = "HTTP/1.1"
-    server_address_behind = ("127.0.0.1", 0)
-    numbers = count(1)
-
-    def _pass_on(self) -> None:
-        number, length = next(self.numbers), int(self.headers.get("Content-Length") or 0)
-        body = self.rfile.read(length)
-        if number % 7 == 0:
-            self.close_connection = True
-        elif number % 5 == 0:
-            self._answer(503, {}, b"<Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>")
-        else:
-            behind = HTTPConnection(*self.server_address_behind, timeout=30)
-            headers = {name: value for name, value in self.headers.items() if name.lower() != "expect"}
-            behind.request(self.command, self.path, body, headers)
-            answer = behind.getresponse()
-            self._answer(answer.status, dict(answer.headers), answer.read())
-
-    def _answer(self, status: int, headers: dict[str, str], body: bytes) -> None:
-        self.send_response_only(status)
-        for name, value in headers.items():
-            if name.lower() not in ("transfer-encoding", "connection", "content-length"):
-                self.send_header(name, value)
-        length = headers.get("Content-Length", len(body)) if self.command == "HEAD" else len(body)
-        self.send_header("Content-Length", str(length))
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(body)
-
-    do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = _pass_on
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """An S3 server with a bucket, and the URL of a dataset in it."""
-    import boto3
-    import s3fs
-
-    port = free_port()
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    variables = {"AWS_ACCESS_KEY_ID": "k", "AWS_SECRET_ACCESS_KEY": "s", "AWS_DEFAULT_REGION": "us-east-1"}
-    for name, value in {**variables, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
-        monkeypatch.setenv(name, value)
-    s3fs.S3FileSystem.clear_instance_cache()  # they know the address of the test before
-    try:
-        _make_bucket(boto3.client("s3"))
-        yield process, "s3://datasets/leg.zarr"
-    finally:
-        process.kill()
-        process.wait()
-        s3fs.S3FileSystem.clear_instance_cache()
-
-
-def _make_bucket(client: Any) -> None:
-    for attempt in count():
-        try:
-            client.create_bucket(Bucket="datasets")
-            return
-        except Exception:
-            assert attempt < 30
-            time.sleep(0.5)
+def server() -> Iterator[subprocess.Popen[bytes]]:
+    """An S3 server, to which the environment leads."""
+    with s3_server() as process:
+        yield process
 
 
 @pytest.mark.cluster
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("server")
 def test_overload_and_lost_connections_of_s3_lead_to_the_same_bytes(
-    server: tuple[Any, str], dataset: str, monkeypatch: pytest.MonkeyPatch
+    dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, place = server
-    behind = os.environ["AWS_ENDPOINT_URL"].rsplit(":", 1)[1]
-    monkeypatch.setattr(_Proxy, "server_address_behind", ("127.0.0.1", int(behind)))
-    with ThreadingHTTPServer(("127.0.0.1", 0), _Proxy) as proxy:
-        Thread(target=proxy.serve_forever, daemon=True).start()
-        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{proxy.server_port}")
-        monkeypatch.setattr(remote_objects, "_FIRST_PAUSE", 0.02)
+    monkeypatch.setattr(remote_objects, "_FIRST_PAUSE", 0.02)
+    place = f"{BUCKET}/leg.zarr"
+    with proxied(tmp_path / "requests", busy_every=10, lost_every=7) as proxy:
         made = generate(tiny_dataset(), place)
         assert np.array_equal(made.vertices(4), open_dataset(dataset).vertices(4)) and not list(find_faults(place))
         assert bytes_at(place) == {path: (Path(dataset) / path).read_bytes() for path in objects_at(dataset)}
-        proxy.shutdown()
+        assert len(proxy.requests()) > 200
 
 
 @pytest.mark.cluster
 @pytest.mark.timeout(300)
 def test_s3_that_goes_away_in_the_middle(
-    server: tuple[subprocess.Popen[bytes], str],
+    server: subprocess.Popen[bytes],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
     """Of a training's reads, and of a generation: one line each, soon after the stated time."""
-    process, place = server
     monkeypatch.setattr(remote_objects, "PATIENCE", 3.0)
-    trained_on = generate(tiny_dataset(), place)
+    trained_on = generate(tiny_dataset(), f"{BUCKET}/leg.zarr")
     bank = open_bank(trained_on, trained_on.identities("training"), cache="stream")
 
     def killing(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         for number, row in enumerate(inline(task, arguments)):
             if task is generation.ensure_shard and number == 2:
-                process.kill()
-                process.wait()
+                server.kill()
+                server.wait()
             yield row
 
     monkeypatch.setattr(tasks, "inline", killing)
     began = time.monotonic()
     with pytest.raises(SystemExit):
-        main(["generate", "--recipe", "smoke", "--local", "--out", "s3://datasets/other.zarr"])
+        main(["generate", "--recipe", "smoke", "--local", "--out", f"{BUCKET}/other.zarr"])
     written = capsys.readouterr().err
     errors = [line for line in written.splitlines() if line.startswith("error: ")]
     assert "Traceback" not in written and len(errors) == 1, written

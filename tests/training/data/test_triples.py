@@ -110,9 +110,10 @@ def test_blocks_need_few_meshes_at_a_time_and_each_shard_for_a_while(grid: dict[
     mesh = rows.sizes.max() * columns.sizes.max()
     triples = order.epoch(0)[: steps * order.batch].reshape(steps, order.lanes, width, 4)
     for lane in range(order.lanes):
-        shard = [(rows.of[t], columns.of[p]) for _, p, t, _ in triples[:, lane].reshape(-1, 4).tolist()]
-        spans = {key: len(shard) - shard[::-1].index(key) - shard.index(key) for key in set(shard)}
-        assert max(spans.values()) <= order.reach + 9 * mesh + 1
+        _, pose, target, _ = triples[:, lane].reshape(-1, 4).T
+        shard = rows.of[target] * len(columns.sizes) + columns.of[pose]
+        (_, first), (_, last) = (np.unique(way, return_index=True) for way in (shard, shard[::-1]))
+        assert (len(shard) - last - first).max() <= order.reach + 9 * mesh + 1
 
 
 SHUFFLED = TripleOrder(identities=[3, 5, 8], poses=range(10, 17), batch=12, seed=2)
