@@ -82,12 +82,13 @@ def _measured(
         Row(contender.name, pose_type, start + place, *map(int, triples[place]), *astuple(score), *astuple(dressed))
         for contender in contenders
         for place, (score, dressed) in enumerate(
-            _measure_each(groups, _output(contender, batch, dataset, triples), batch.truth, recipe)
+            _measure_each(groups, outputs_of(contender, batch, dataset, triples), batch.truth, recipe)
         )
     ]
 
 
-def _output(contender: Contender, batch: Batch, dataset: Dataset, triples: NDArray[np.integer]) -> Tensor:
+def outputs_of(contender: Contender, batch: Batch, dataset: Dataset, triples: NDArray[np.integer]) -> Tensor:
+    """What a contender makes of some triples [b, v, 3], in the truth's box; ``batch`` is theirs, padded."""
     if contender.name == SKINNED:
         return _skinned(dataset, triples, batch.truth)
     if contender.name in NO_OPS:
