@@ -99,6 +99,27 @@ def test_three_ranks_share_a_batch_of_four_unequally(dataset: str, tmp_path: Pat
     assert torch.allclose(losses(tmp_path / "three"), losses(tmp_path / "one"), rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
+def test_four_ranks_then_two_then_four_learn_as_one(dataset: str, tmp_path: Path) -> None:
+    """An elastic group that loses half of its machines and gets them back, in both orders of triples."""
+    given = {"steps": 12, "checkpoint_every": 4, "evaluate_every": 12, "batch": 8, "precision": "float64"}
+    orders: dict[str, dict[str, Any]] = {"shuffled": {}, "in blocks": {"block": "30kB", "cache": "stream"}}
+    for name, order in orders.items():
+        train(tiny_training(**given, **order), data=dataset, run=tmp_path / "one" / name)
+    elastic = {**given, "launcher": "ray", "ranks": 4, "fewest_ranks": 2}
+    jobs = [(tiny_training(**elastic, **order), tmp_path / name) for name, order in orders.items()]
+    for ranks, until in ((4, 4), (2, 8), (4, 12)):
+        train_in_turn(jobs, data=dataset, place=tmp_path, count=ranks)
+        for folder in tmp_path.glob("*/checkpoints/step-*"):
+            if int(folder.name.removeprefix("step-")) > until:
+                shutil.rmtree(folder)
+    for name in orders:
+        one, found = tmp_path / "one" / name, tmp_path / name
+        assert torch.allclose(losses(found), losses(one), rtol=1e-6, atol=0)
+        expected, weights = (require_checkpoint(run).weights() for run in (one, found))
+        assert all(torch.allclose(weights[key], value, rtol=0, atol=2e-4) for key, value in expected.items())
+
+
 def test_a_spectral_norm_iterates_once_a_step_and_a_single_part_is_as_without(
     dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
