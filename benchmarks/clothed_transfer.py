@@ -1,36 +1,28 @@
-"""Networks on people in clothes, whose truth is draped: a table by what the target wears, depth in the body, a picture.
+"""Networks on people in clothes, whose truth is draped: a table by what the target wears, and a picture.
 
 python -m benchmarks.clothed_transfer table DATA FOLDER NAME=WEIGHTS [NAME=WEIGHTS ...] [--triples 100]
-python -m benchmarks.clothed_transfer depth DATA FOLDER NAME=WEIGHTS [...]
 python -m benchmarks.clothed_transfer picture DATA FOLDER NAME=WEIGHTS [...] --picture docs/images/clothed-transfer.png
 
 DATA is of the body `mixed`: Anny, then `clothed` (recipe `clothed-transfer-test`). FOLDER keeps what is measured; the
-same command again goes on. The picture shows of each outfit the triple of the median PMD of the last network. Depth is
-that of an output's garments within the whole body of the truth, so that a wrong pose counts as well.
+same command again goes on. The picture shows of each outfit the triple of the median PMD of the last network.
 """
 
 import argparse
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from datagen.bodies.clothed.draping import depths
-from datagen.bodies.clothed.model import ClothedModel, body_faces
-from datagen.bodies.skinning import skin
 from datagen.generate import inline
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.mesh.parts import part_colors
-from datagen.poses import Poses
 from datagen.recipe import ClothedBody, MixedBody
 from datagen.store import Dataset, open_dataset
 from training.data.batch import read_batch
-from training.evaluation.evaluate import Method, Row, evaluate, evaluation_list, triples_in
-from training.evaluation.measure import POSE_TYPES, SKINNED, Contender, outputs_of
+from training.evaluation.evaluate import Method, Row, evaluate, triples_in
+from training.evaluation.measure import SKINNED, Contender, outputs_of
 from training.evaluation.tables import COLUMNS, DRESSED_COLUMNS, Column
 from training.recipes.training import EvaluationRecipe
 from training.viz.mesh_grid import Panel, mesh_grid, standing
@@ -40,11 +32,10 @@ from workflows.pretrained import weights_named
 _EMD_POINTS = 512
 _BARE, _TRUTH = "bare", "the truth"
 _SHOWN = ("pmd", "chamfer", "earth_mover", "millimetres", "edge_ratio", "normal_degrees")
-_DEEP = 0.002
 
 
 class People:
-    """The people of a dataset, what they wear, and the bodies below it; ``about``: which triples are measured, how."""
+    """The people of a dataset, and what they wear; ``about``: which triples are measured, how."""
 
     def __init__(self, dataset: Dataset, about: EvaluationRecipe) -> None:
         self.dataset, self.about = dataset, about
@@ -52,22 +43,11 @@ class People:
         assert isinstance(mixed, MixedBody), mixed
         recipe = mixed.bodies[1]
         assert isinstance(recipe, ClothedBody), recipe
-        self._recipe, self.outfits = recipe, recipe.outfits
-
-    @cached_property
-    def _model(self) -> ClothedModel:
-        return ClothedModel(self._recipe)
+        self.outfits = recipe.outfits
 
     def worn(self, identity: int) -> str:
         """The name of an identity's outfit."""
         return _BARE if self.dataset.part(identity) is None else self.outfits[int(self._own(identity)[-2])]
-
-    def body(self, identity: int, pose: int) -> NDArray[np.float32]:
-        """The whole body [v, 3] of a dressed identity in a pose, metres."""
-        joints, parents = self.dataset.attributes["joints"], self.dataset.attributes["joint_parents"]
-        posed = Poses(tuple(joints), tuple(parents), self.dataset.rotations()[pose : pose + 1])
-        person = self._model.person(tuple(self._own(identity)))
-        return skin(person.body, self._model.world_rotations(posed))[0]
 
     def mesh(self, identity: int, pose: int) -> Mesh:
         """An identity in a pose as it is stored, metres."""
@@ -102,26 +82,6 @@ def outputs(people: People, methods: Sequence[Method], triples: NDArray[np.integ
             for each, truth in zip(found, truths, strict=True)
         ]
     return made
-
-
-def depth(people: People, methods: Sequence[Method]) -> None:
-    """Print of each outfit and method the mean share of garment vertices deeper than 2 mm in the body, as Markdown."""
-    found: dict[tuple[str, str], list[float]] = defaultdict(list)
-    listed = np.concatenate([evaluation_list(people.dataset, people.about, pose_type) for pose_type in POSE_TYPES])
-    triples = np.array([its for its in listed if people.worn(its[2]) != _BARE])
-    for start in range(0, len(triples), people.about.chunk):
-        some = triples[start : start + people.about.chunk]
-        for name, meshes in outputs(people, methods, some).items():
-            for (_, pose, identity, _), mesh in zip(some.tolist(), meshes, strict=True):
-                part = people.dataset.part(identity)
-                assert part is not None
-                garment = mesh.vertices[part > 0].astype(np.float32)
-                inside = depths(garment, people.body(identity, pose), body_faces()) > _DEEP
-                found[people.worn(identity), name].append(float(inside.mean()))
-        print(f"{start + len(some)} of {len(triples)} dressed triples", flush=True)
-    for outfit in people.outfits:
-        names = (name for worn, name in found if worn == outfit)
-        print(f"| `{outfit}` |", ", ".join(f"{name} {np.mean(found[outfit, name]):.1%}" for name in names), "|")
 
 
 def table(people: People, rows: Sequence[Row]) -> None:
@@ -192,7 +152,7 @@ def _method(word: str) -> Method:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["table", "depth", "picture"])
+    parser.add_argument("what", choices=["table", "picture"])
     parser.add_argument("data")
     parser.add_argument("folder", type=Path)
     parser.add_argument("methods", nargs="+", type=_method, metavar="NAME=WEIGHTS")
@@ -201,9 +161,7 @@ if __name__ == "__main__":
     given = parser.parse_args()
     its_about = EvaluationRecipe(emd_points=_EMD_POINTS, triples=given.triples)
     its_people = People(open_dataset(given.data), its_about)
-    if given.what == "depth":
-        depth(its_people, given.methods)
-    elif given.what == "table":
+    if given.what == "table":
         table(its_people, measured(its_people, given.folder, given.methods))
     else:
         picture(its_people, given.methods, measured(its_people, given.folder, given.methods), given.picture)
