@@ -22,8 +22,6 @@ from training.tracking.journal import coefficient_metrics
 
 log = logging.getLogger(__name__)
 
-log = logging.getLogger(__name__)
-
 
 class TransferValidation:
     """Metrics and pictures of fixed triples of a dataset's evaluation lists, so that curves of a run are comparable.
