@@ -23,7 +23,8 @@ from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
 from datagen.common.seeding import Stream, generator
-from datagen.generate import ensure_shard, generate, prepare
+from datagen.generate import ensure_shards, generate
+from datagen.generate.plan import prepare
 from datagen.grid import Shard
 from datagen.mesh.rig import part_transforms
 from datagen.poses import draw_poses
@@ -101,7 +102,7 @@ def measure(topology: str, folder: Path) -> None:
         ),
         "anny": (forward, POSES),
         "body": (lambda: body.vertices(parameters, poses), POSES),
-        "shard": (lambda: ensure_shard(url, recipe, todo.pop()), POSES),
+        "shard": (lambda: ensure_shards(url, recipe, [(todo.pop(), None)]), POSES),
     }
     forward(), body.vertices(parameters, poses)
     found = {name: [] for name in ways}  # type: dict[str, list[float]]
@@ -138,11 +139,12 @@ _WORKER = """
 import sys, tempfile
 from benchmarks.generation import recipe_of
 from benchmarks.peak_memory import peak_mebibytes
-from datagen.generate import ensure_shard, prepare
+from datagen.generate import ensure_shards
+from datagen.generate.plan import prepare
 recipe = recipe_of(sys.argv[1], identities=int(sys.argv[2]))
 with tempfile.TemporaryDirectory() as folder:
     for shard in prepare(f"{folder}/x.zarr", recipe).shards():
-        ensure_shard(f"{folder}/x.zarr", recipe, shard)
+        ensure_shards(f"{folder}/x.zarr", recipe, [(shard, None)])
 print(peak_mebibytes())
 """
 
@@ -165,6 +167,7 @@ def scaling(topology: str, identities: int) -> None:
     import ray
 
     from datagen.generate import ray_runner
+    from datagen.generate.shards import batches
 
     rates = []
     for workers in (1, 2):
@@ -172,9 +175,10 @@ def scaling(topology: str, identities: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             for name, count in (("warm", 8), ("timed", identities)):
                 recipe, url = recipe_of(topology, count), f"{folder}/{name}.zarr"
-                arguments = [(url, recipe, shard) for shard in prepare(url, recipe).shards()]
+                wanted = [(shard, None) for shard in prepare(url, recipe).shards()]
+                tasks = [(url, recipe, some) for some in batches(recipe, wanted)]
                 began = time.perf_counter()
-                meshes = sum(row.rows for row in ray_runner(ensure_shard, arguments))
+                meshes = sum(row.rows for rows in ray_runner(ensure_shards, tasks) for row in rows)
             rates.append(meshes / (time.perf_counter() - began))
         ray.shutdown()
     print(

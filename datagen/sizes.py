@@ -21,7 +21,7 @@ _LOOKED_AT = 24
 """Identities whose vertices are counted; characters and mixed bodies differ between identities."""
 _DISK_SHARE, _DISK_MESH, _DISK_IDENTITY, _DISK_POSE = 0.85, 120, 100, 600
 """After compression; and bytes beside the vertices. Anny's bodies compress to 0.80, legs to 0.76."""
-_SECONDS_MESH, _SECONDS_VERTEX, _SECONDS_IDENTITY, _SECONDS_POSE = 110e-6, 33e-9, 1e-3, 0.4e-3
+_SECONDS_MESH, _SECONDS_VERTEX, SECONDS_IDENTITY, SECONDS_POSE = 110e-6, 33e-9, 1e-3, 0.4e-3
 _MEMORY_IDENTITY, _MEMORY_POSE, _MEMORY_SHARD, _MEMORY_TRIPLE = 20_000, 2_000, 1_000, 120
 _MEMORY_VERTEX, _MEMORY_MESHES = 460, 3
 """Bytes of a body a vertex, and how often a task holds the vertices of its shard."""
@@ -106,16 +106,21 @@ def require_disk(size: DatasetSize, url: str) -> None:
         )
 
 
+def seconds_of(recipe: DatasetRecipe, meshes: int, vertices: float) -> float:
+    """Return the seconds that one core takes to make meshes of so many vertices."""
+    return meshes * (_SECONDS_MESH + vertices * _SECONDS_VERTEX + recipe.body.seconds_a_mesh)
+
+
 def _sized(recipe: DatasetRecipe, vertices: float | None, workers: int) -> DatasetSize:
     grid = Grid(recipe)
     meshes, identities, poses = grid.mesh_count, grid.identity_count, grid.pose_count
     raw = meshes * (vertices or 0) * _VERTEX
-    spent = meshes * (_SECONDS_MESH + (vertices or 0) * _SECONDS_VERTEX + recipe.body.seconds_a_mesh)
+    spent = seconds_of(recipe, meshes, vertices or 0)
     return DatasetSize(
         meshes=meshes,
         vertices=vertices,
         disk=_DISK_SHARE * raw + _DISK_MESH * meshes + _DISK_IDENTITY * identities + _DISK_POSE * poses,
-        seconds=spent / workers + _SECONDS_IDENTITY * identities + _SECONDS_POSE * poses,
+        seconds=spent / workers + SECONDS_IDENTITY * identities + SECONDS_POSE * poses,
         memory=_memory_of(grid, vertices or 0, workers),
     )
 

@@ -26,13 +26,17 @@ class LegModel:
 
     def __init__(self, recipe: LegBody) -> None:
         self._rings, self._segments = recipe.rings, recipe.segments
+        self._faces = self._tube()
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
         return np.array([random.uniform(low, high) for low, high in _RANGES.values()])
 
     def faces(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Triangles [face, 3] of the tube and its two caps."""
+        """Triangles [face, 3] of the tube and its two caps; the same for all identities."""
+        return self._faces
+
+    def _tube(self) -> NDArray[np.int32]:
         ring, step = np.meshgrid(np.arange(self._rings - 1), np.arange(self._segments), indexing="ij")
         first = (ring * self._segments + step).ravel()
         right = (ring * self._segments + (step + 1) % self._segments).ravel()

@@ -94,13 +94,15 @@ def rig_of(
         else:
             part_of.append(len(kept))
             kept.append(bone)
-    folded = scipy.sparse.csr_array(rest.weights) @ np.eye(len(kept))[part_of]
+    weights = rest.weights
+    if len(kept) < len(names) or not isinstance(weights, np.ndarray):
+        weights = scipy.sparse.csr_array(weights) @ np.eye(len(kept))[part_of]
     return Rig(
         names=tuple(names[bone] for bone in kept),
         parents=tuple(part_of[rest.parents[bone]] if rest.parents[bone] >= 0 else -1 for bone in kept),
         drivers=tuple(drivers[bone] for bone in kept),
         corrections=corrections[kept],
-        weights=folded.astype(np.float32),
+        weights=weights.astype(np.float32),
         joints=rest.joints[kept].astype(np.float32),
     )
 

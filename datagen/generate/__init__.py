@@ -1,19 +1,22 @@
 """Generation: a driver that can always be run again around ``make_shard``, a pure function of (recipe, shard).
 
-The driver asks for every shard of the grid. A task returns the manifest row of a shard that is there and sound, or
-makes and writes it; so a run after any interruption does only what is missing, and the bytes come out the same.
+The driver asks for every shard of the grid that the manifest does not vouch for; while it runs it commits a manifest of
+the shards so far every now and then. A task makes and writes some shards, unless they are there and sound; so a run
+after any interruption does only what is missing, and the bytes come out the same.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 
 from pydantic import ValidationError
 
 from datagen.bodies import load_body
-from datagen.common.errors import BodyError, DatasetError, RecipeError
-from datagen.generate.plan import assets_of
-from datagen.generate.runners import Runner, Task, inline, ray_runner
-from datagen.generate.shards import ensure_shard, make_shard, prepare
+from datagen.common.errors import BodyError, DatasetError, DsffnetError, RecipeError, StorageError
+from datagen.generate.plan import assets_of, prepare
+from datagen.generate.runners import Progress, Runner, Task, inline, ray_runner, unseen
+from datagen.generate.shards import Wanted, batches, ensure_shards, make_shard
 from datagen.grid import Grid
 from datagen.recipe import DatasetRecipe, Growth
 from datagen.recipe.text import faults_text
@@ -24,14 +27,14 @@ from datagen.store.manifest import ManifestRow
 from datagen.store.reader import Dataset, open_dataset
 from datagen.store.schema import check_extent, open_group, stored_recipe
 from datagen.store.verify import Fault, find_faults
-from datagen.store.writer import committed_hashes, finish
+from datagen.store.writer import committed_hashes, finish, save, vouched_rows
 
 __all__ = [
+    "Progress",
     "Runner",
-    "ShardProgress",
     "Task",
     "append",
-    "ensure_shard",
+    "ensure_shards",
     "generate",
     "grown_recipe",
     "inline",
@@ -42,7 +45,8 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
-ShardProgress = Callable[[Iterator[ManifestRow], Grid], Iterable[ManifestRow]]
+_SAVE_SECONDS, _SAVE_SHARE = 10.0, 50
+"""Between two manifests of the shards so far, at least, and as many times as long as one takes."""
 
 
 def generate(
@@ -50,7 +54,7 @@ def generate(
     url: str,
     *,
     run: Runner = inline,
-    progress: ShardProgress = lambda rows, grid: rows,
+    progress: Progress = unseen,
     fresh: bool = False,
 ) -> Dataset:
     """Make the dataset at ``url``, or what is missing of it; a complete one is returned as it is.
@@ -64,7 +68,7 @@ def generate(
     run
         Where the tasks run.
     progress
-        Wraps the stream of finished shards, for a progress bar.
+        Shows what is made, see :data:`datagen.generate.runners.Progress`.
     fresh
         Remove what is there first.
 
@@ -96,7 +100,7 @@ def append(
     unseen: int | None = None,
     recipe: DatasetRecipe | None = None,
     run: Runner = inline,
-    progress: ShardProgress = lambda rows, grid: rows,
+    progress: Progress = unseen,
 ) -> Dataset:
     """Give an existing dataset more identities or poses, up to these totals; no shard that is there is touched.
 
@@ -118,8 +122,8 @@ def append(
         require_memory(grown)
         check_extent(url, grown)
         if grown != stored:
-            open_dataset(url)  # an unfinished one must be finished first, and says how
-            _make_missing(grown, url, run, progress, growing=True)
+            before = open_dataset(url)  # an unfinished one must be finished first, and says how
+            _make_missing(grown, url, run, progress, before=before)
         elif not _complete(url, stored):
             _make_missing(stored, url, run, progress)
     return open_dataset(url)
@@ -177,15 +181,53 @@ def _make_missing(
     recipe: DatasetRecipe,
     url: str,
     run: Runner,
-    progress: ShardProgress,
+    progress: Progress,
     *,
-    growing: bool = False,
-    lost: Sequence[str] = (),
+    before: Dataset | None = None,
+    faults: Sequence[Fault] = (),
 ) -> None:
-    (arrays,) = run(prepare, [(url, recipe, growing, lost)])
+    """Make what is missing of a dataset, which grows from ``before``, or of which ``faults`` were found."""
     committed = committed_hashes(url)
-    shards = [(url, recipe, shard, committed.get(shard.path)) for shard in arrays.shards()]
-    finish(url, recipe, list(progress(run(ensure_shard, shards), Grid(recipe))))
+    vouched = vouched_rows(url, {fault.path for fault in faults})
+    lost = [fault.path for fault in faults if not fault.shard]
+    arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, rows=vouched)
+    there, rows, missing = {row.place: row for row in vouched or ()}, list[ManifestRow](), list[Wanted]()
+    for shard in arrays.shards():
+        row = there.get(shard.place)
+        if row is not None and row.rows == shard.rows:
+            rows.append(row)
+        else:
+            missing.append((shard, committed.get(shard.path)))
+    tasks = [(url, recipe, some) for some in batches(recipe, missing)]
+    results = ((sum(row.rows for row in made), made) for made in run(ensure_shards, tasks))
+    done = sum(row.rows for row in rows)
+    with _saving(url, recipe, rows) as add:
+        for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
+            add(made)
+    finish(url, recipe, rows)
+
+
+@contextmanager
+def _saving(url: str, recipe: DatasetRecipe, rows: list[ManifestRow]) -> Iterator[Callable[[list[ManifestRow]], None]]:
+    """Collect rows, and save them now and then and where the block is left early."""
+    due = time.monotonic() + _SAVE_SECONDS
+
+    def add(made: list[ManifestRow]) -> None:
+        nonlocal due
+        rows.extend(made)
+        if (began := time.monotonic()) >= due:
+            save(url, recipe, rows)
+            now = time.monotonic()
+            due = now + max(_SAVE_SECONDS, _SAVE_SHARE * (now - began))
+
+    try:
+        yield add
+    except StorageError:  # nothing can be written
+        raise
+    except BaseException:
+        with suppress(DsffnetError, OSError):  # the first error is the one to report
+            save(url, recipe, rows)
+        raise
 
 
 def repair(
@@ -194,11 +236,11 @@ def repair(
     faults: list[Fault],
     *,
     run: Runner = inline,
-    progress: ShardProgress = lambda rows, grid: rows,
+    progress: Progress = unseen,
 ) -> Dataset:
     """Make the faulty shards and other objects again and check that the dataset is whole; the rest is not touched."""
     with writing_alone(url):
-        _make_missing(recipe, url, run, progress, lost=[fault.path for fault in faults if not fault.shard])
+        _make_missing(recipe, url, run, progress, faults=faults)
     left = list(find_faults(url))
     if left:
         raise DatasetError(f"{url}: {left[0].path} is still faulty after repair ({left[0].reason})")

@@ -2,20 +2,25 @@
 
 import importlib.metadata
 import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies import BodyModel, load_body, part_labels, require_joints
+from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.common.assets import git
-from datagen.common.seeding import Stream, generator
-from datagen.generate.rigs import RigCollection
+from datagen.generate.identities import Identities, describe_identities, joined, stored_identities
+from datagen.generate.runners import Progress, Runner, Task, inline, unseen
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
 from datagen.recipe import DatasetRecipe
-from datagen.store.writer import Plan
+from datagen.sizes import SECONDS_IDENTITY, SECONDS_POSE
+from datagen.store import Dataset, ManifestRow
+from datagen.store.writer import Plan, begin, begun
 
 READS_FOLDERS = ("imported", "mixed")
 """Families whose assets are whole folders: they are hashed once, when a dataset is begun, and not in every worker."""
@@ -23,76 +28,138 @@ _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
 _CONTENT = 2
 """The version of what a recipe means, part of the uuid: formats 2 and 3 hold the same meshes."""
 _PACKAGES = ("anny", "smplx", "numpy", "scipy", "warp-lang", "zarr", "numcodecs")
+_BLOCK_SECONDS, _MOST_IN_BLOCK = 0.5, 1000
+"""Of work in a task that describes identities or draws poses, and how many at most."""
 
 
-def identity_parameters(recipe: DatasetRecipe, body: BodyModel, identity: int) -> NDArray[np.float64]:
-    """Parameters [parameter] of identity number ``identity``, a function of (seed, identity) alone."""
-    return body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, identity), identity)
+@dataclass(frozen=True)
+class Head:
+    """What a recipe and its assets say of a dataset before anything is drawn: attributes and provenance."""
+
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
 
 
-def plan_of(recipe: DatasetRecipe) -> Plan:
-    """Return the plan of a recipe's dataset; nothing is written.
+def head_of(url: str, recipe: DatasetRecipe) -> Head:
+    """Return the head of a recipe's dataset; a task.
 
     Raises
     ------
     BodyError
-        The body model or the poses cannot be loaded, or do not fit each other; there are too few poses or files.
+        The body model or the poses cannot be loaded, or do not fit each other; there are too few files.
     """
-    body, source, grid = load_body(recipe.body), load_poses(recipe.poses), Grid(recipe)
+    body, source = load_body(recipe.body), load_poses(recipe.poses)
     require_joints(body, source, family=recipe.body.family)
     require_files(recipe)
-    poses = draw_poses(recipe.poses, range(grid.pose_count)).rotations
-    parameters = [identity_parameters(recipe, body, identity) for identity in range(grid.identity_count)]
-    topologies = _Topologies(recipe, body)
-    table, numbers, rig_numbers = RigCollection(), [], []
-    for identity, parameter in enumerate(parameters):  # all of a person at once, who may be dear to make
-        numbers.append(topologies.number_of(identity, parameter))
-        rig_numbers.append(table.add(body.rig(parameter, source.joints)))
-    labelled = {"labelled": list(topologies.labels)} if topologies.labels else {}
-    return Plan(
-        attributes={**_attributes(recipe, body, source), "rigs": table.parts, **labelled},
+    return Head(
+        attributes=_attributes(recipe, body, source),
         provenance={
             "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
             "git_commit": git("rev-parse", "HEAD") or "unknown",
         },
-        arrays=GridArrays(grid, numbers, topologies.vertices),
-        parameters=np.stack(parameters),
-        faces=topologies.faces,
-        labels=topologies.labels,
-        poses=poses,
-        triples=evaluation_lists(grid),
-        rigs=table.rigs,
-        rig_numbers=np.array(rig_numbers, np.int32),
     )
 
 
-class _Topologies:
-    """The topologies of a body's identities, numbered as they appear, each with its triangles and count of vertices.
+def plan_of(
+    recipe: DatasetRecipe,
+    *,
+    head: Head | None = None,
+    before: Dataset | None = None,
+    run: Runner = inline,
+    progress: Progress = unseen,
+) -> Plan:
+    """Return the plan of a recipe's dataset; nothing is written.
 
-    Vertices are counted by their labels, or in a mesh of the first identity that has them: some may be in no face.
+    Parameters
+    ----------
+    before
+        A dataset that the recipe's grows from: what it says of its identities and poses is kept.
+    run, progress
+        Where tasks run that describe identities and draw poses, and what shows them.
+
+    Raises
+    ------
+    BodyError
+        See :func:`head_of`; or there are too few poses.
     """
+    grid, head = Grid(recipe), head or head_of("", recipe)
+    there = (before.grid.identity_count, before.grid.pose_count) if before else (0, 0)
+    work = _Work(recipe, run, progress)
+    seconds = SECONDS_IDENTITY + recipe.body.seconds_a_mesh
+    described = work.blocks(describe_identities, range(there[0], grid.identity_count), seconds, unit="identity")
+    people = joined([stored_identities(before), *described] if before else described)
+    drawn = work.blocks(draw_rotations, range(there[1], grid.pose_count), SECONDS_POSE, unit="pose")
+    rotations = [each.rotations for each in sorted(drawn, key=attrgetter("first"))]
+    return Plan(
+        attributes={**head.attributes, "rigs": people.parts, **_labelled(people)},
+        provenance=head.provenance,
+        arrays=people.arrays(grid),
+        parameters=people.parameters,
+        faces=[topology.faces for topology in people.topologies],
+        labels=people.labels,
+        poses=np.concatenate([before.rotations(), *rotations] if before else rotations),
+        triples=evaluation_lists(grid),
+        rigs=people.rigs,
+        rig_numbers=people.rig_numbers,
+    )
 
-    def __init__(self, recipe: DatasetRecipe, body: BodyModel) -> None:
-        self.faces: list[NDArray[np.int32]] = []
-        self.vertices: list[int] = []
-        self.labels: dict[int, NDArray[np.int32]] = {}
-        self._recipe, self._body, self._grid = recipe, body, Grid(recipe)
-        self._numbers: dict[bytes, int] = {}
 
-    def number_of(self, identity: int, parameters: NDArray[np.float64]) -> int:
-        """The number of an identity's topology."""
-        faces = self._body.faces(parameters)
-        number = self._numbers.setdefault(faces.tobytes(), len(self.faces))
-        if number == len(self.faces):
-            self.faces.append(faces)
-            if (labels := part_labels(self._body, parameters)) is not None:
-                self.labels[number] = labels
-            self.vertices.append(self._count(identity, parameters) if labels is None else len(labels))
-        return number
+@dataclass(frozen=True, eq=False)
+class DrawnPoses:
+    """Rotations [pose, joint, 3] of a run of poses, and the number of the first."""
 
-    def _count(self, identity: int, parameters: NDArray[np.float64]) -> int:
-        one_pose = draw_poses(self._recipe.poses, self._grid.poses_of(identity)[:1])
-        return self._body.vertices(parameters, one_pose).shape[1]
+    first: int
+    rotations: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+
+def draw_rotations(url: str, recipe: DatasetRecipe, numbers: range) -> DrawnPoses:
+    """Draw a run of poses; a task."""
+    return DrawnPoses(numbers[0], draw_poses(recipe.poses, numbers).rotations)
+
+
+@dataclass(frozen=True)
+class _Work:
+    recipe: DatasetRecipe
+    run: Runner
+    progress: Progress
+
+    def blocks(self, task: Task, numbers: range, seconds: float, *, unit: str) -> Iterator[Any]:
+        """Results of a task over blocks of numbers, each of which takes some seconds; one block is not shown."""
+        size = min(_MOST_IN_BLOCK, max(1, int(_BLOCK_SECONDS / seconds)))
+        blocks = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+        results = self.run(task, [("", self.recipe, block) for block in blocks])
+        if len(blocks) < 2:
+            return results
+        return self.progress(((len(result), result) for result in results), unit=unit, total=len(numbers), done=0)
+
+
+def _labelled(people: Identities) -> dict[str, list[int]]:
+    return {"labelled": list(people.labels)} if people.labels else {}
+
+
+def prepare(
+    url: str,
+    recipe: DatasetRecipe,
+    *,
+    run: Runner = inline,
+    progress: Progress = unseen,
+    before: Dataset | None = None,
+    lost: Sequence[str] = (),
+    rows: Sequence[ManifestRow] | None = None,
+) -> GridArrays:
+    """Create all of a dataset but its shards, unless that is there; return where its meshes go.
+
+    See :func:`plan_of` and :func:`datagen.store.writer.begin`.
+    """
+    (head,) = run(head_of, [(url, recipe)])
+    if before is None and not lost and (arrays := begun(url, recipe, head.attributes)) is not None:
+        return arrays
+    plan = plan_of(recipe, head=head, before=before, run=run, progress=progress)
+    begin(url, plan, growing=before is not None, lost=lost, rows=rows)
+    return plan.arrays
 
 
 def _attributes(recipe: DatasetRecipe, body: BodyModel, source: PoseSource) -> dict[str, Any]:

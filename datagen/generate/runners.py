@@ -5,14 +5,22 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from datagen.common.errors import ClusterError
-from datagen.recipe import DatasetRecipe
 
 log = logging.getLogger(__name__)
 _SILENCE = 120.0  # seconds without a finished task before a person is told
 
-Task = Callable[[str, DatasetRecipe, Any], Any]
+Progress = Callable[..., Iterator[Any]]
+"""Shows results as they come: of pairs (amount, result) it yields the results. Named arguments: ``unit``, ``total`` and
+``done``, the amount that was there before."""
+Task = Callable[..., Any]
+"""A function of a dataset's URL, its recipe, and what of it is to be made."""
 Runner = Callable[[Task, list[tuple[Any, ...]]], Iterator[Any]]
 """Runs a function over argument tuples, yields results as they come: :func:`inline` or :func:`ray_runner`."""
+
+
+def unseen(results: Iterator[tuple[int, Any]], **amounts: Any) -> Iterator[Any]:
+    """Show nothing."""
+    return (result for _, result in results)
 
 
 def inline(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:

@@ -1,32 +1,29 @@
-"""The tasks of generation: what comes before the shards, and each shard. Each can be repeated at any time."""
+"""The tasks that make shards, which can be repeated at any time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies import load_body
+from datagen.bodies import BodyModel, load_body
 from datagen.common.errors import BodyError
-from datagen.generate.plan import READS_FOLDERS, assets_of, identity_parameters, plan_of
-from datagen.grid import GridArrays, Shard
-from datagen.mesh.geometry import bounds
-from datagen.poses import draw_poses
-from datagen.recipe import DatasetRecipe
+from datagen.generate.identities import identity_parameters
+from datagen.generate.plan import READS_FOLDERS, assets_of
+from datagen.grid import Shard
+from datagen.mesh.geometry import Bounds, bounds
+from datagen.poses import Poses, draw_poses
+from datagen.recipe import DatasetRecipe, PoseRecipe
+from datagen.sizes import seconds_of
 from datagen.store.attributes import check_same_assets
 from datagen.store.manifest import ManifestRow
 from datagen.store.schema import open_group
-from datagen.store.writer import begin, existing_shard, require_driven, write_shard
+from datagen.store.writer import ShardWriter, existing_shard
 
-
-def prepare(url: str, recipe: DatasetRecipe, growing: bool = False, lost: Sequence[str] = ()) -> GridArrays:
-    """Load the body model and the poses, check that they fit, and create all of the dataset but its shards.
-
-    Returns where its meshes go. See :func:`datagen.store.writer.begin`.
-    """
-    plan = plan_of(recipe)
-    begin(url, plan, growing=growing, lost=lost)
-    return plan.arrays
+Wanted = tuple[Shard, str | None]
+"""A shard, and its sha256 where the dataset has a manifest already: other bytes are neither kept nor written."""
+_TASK_SECONDS, _FEWEST_TASKS = 0.5, 64
+"""Of work in a task at most, and tasks at least: for many workers, and for progress that is seen."""
 
 
 def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
@@ -35,23 +32,42 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
     Raises
     ------
     BodyError
-        The body model gave coordinates that are not finite, a mesh without extent, or other vertices than planned.
+        The body model gave other vertices than planned.
     """
-    body, poses = load_body(recipe.body), draw_poses(recipe.poses, shard.poses)
+    body, poses = load_body(recipe.body), _poses(recipe.poses.model_dump_json(), shard.poses)
+    made = (_meshes(recipe, body, identity, shard, poses) for identity in shard.identities)
+    if len(shard.identities) == 1:
+        return next(made)[None]
     meshes = np.empty((len(shard.identities), len(shard.poses), shard.vertices, 3), np.float32)
-    for place, identity in enumerate(shard.identities):
-        vertices = body.vertices(identity_parameters(recipe, body, identity), poses)
-        if vertices.shape[1] != shard.vertices:
-            raise BodyError(
-                f"identity {identity} has {vertices.shape[1]:,} vertices in pose {shard.poses[0]}, and had "
-                f"{shard.vertices:,} when the dataset was begun. Use the files that it was begun with, and run again"
-            )
+    for place, vertices in enumerate(made):
         meshes[place] = vertices
-    _require_extent(recipe, shard, meshes)
     return meshes
 
 
-def _require_extent(recipe: DatasetRecipe, shard: Shard, meshes: NDArray[np.float32]) -> None:
+@lru_cache(maxsize=128)
+def _poses(recipe: str, numbers: range) -> Poses:
+    """The poses of a shard, kept with their world rotations for the next identities (0.2 MB for 100 of SMPL's)."""
+    return draw_poses(PoseRecipe.model_validate_json(recipe), numbers)
+
+
+def _meshes(recipe: DatasetRecipe, body: BodyModel, identity: int, shard: Shard, poses: Poses) -> NDArray[np.float32]:
+    vertices = body.vertices(identity_parameters(recipe, body, identity), poses)
+    if vertices.shape[1] != shard.vertices:
+        raise BodyError(
+            f"identity {identity} has {vertices.shape[1]:,} vertices in pose {shard.poses[0]}, and had "
+            f"{shard.vertices:,} when the dataset was begun. Use the files that it was begun with, and run again"
+        )
+    return vertices
+
+
+def sound_bounds(recipe: DatasetRecipe, shard: Shard, meshes: NDArray[np.float32]) -> Bounds:
+    """Lowest and highest coordinates [mesh, 3] of the meshes of a shard.
+
+    Raises
+    ------
+    BodyError
+        Some are not finite, or a mesh has no extent.
+    """
     low, high = bounds(meshes.reshape(-1, *meshes.shape[2:]))
     sound = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & ((high - low).max(axis=1) > 0)
     faulty = np.flatnonzero(~sound.reshape(meshes.shape[:2]).all(axis=1))
@@ -62,24 +78,42 @@ def _require_extent(recipe: DatasetRecipe, shard: Shard, meshes: NDArray[np.floa
             f"identity {identity} (parameters {parameters.tolist()}) has a degenerate or non-finite mesh in "
             f"poses {shard.poses[0]} to {shard.poses[-1]}. Narrow the identity ranges of the recipe"
         )
+    return low, high
 
 
-def ensure_shard(url: str, recipe: DatasetRecipe, shard: Shard, committed: str | None = None) -> ManifestRow:
-    """The manifest row of a shard, which is made and written first unless it is there and sound.
+def batches(recipe: DatasetRecipe, shards: Sequence[Wanted]) -> Iterator[list[Wanted]]:
+    """Divide shards among tasks: each makes at least one, half a second of them where there are many."""
+    estimates = [seconds_of(recipe, shard.rows, shard.vertices) for shard, _ in shards]
+    most, batch, seconds = min(_TASK_SECONDS, sum(estimates) / _FEWEST_TASKS), list[Wanted](), 0.0
+    for wanted, estimate in zip(shards, estimates, strict=True):
+        if batch and seconds + estimate > most:
+            yield batch
+            batch, seconds = [], 0.0
+        batch.append(wanted)
+        seconds += estimate
+    if batch:
+        yield batch
 
-    ``committed`` is its sha256 where the dataset has a manifest already: other bytes are neither kept nor written.
+
+def ensure_shards(url: str, recipe: DatasetRecipe, shards: Sequence[Wanted]) -> list[ManifestRow]:
+    """The manifest rows of some shards, each of which is made and written first unless it is there and sound; a task.
 
     Raises
     ------
     DatasetError
         The dataset is being made by another recipe now, or from other assets than this machine has.
     """
-    group = require_driven(url, recipe)
+    writer = ShardWriter(url, recipe)
     require_same_assets(url, recipe.model_dump_json())
-    row = existing_shard(group, recipe, shard)
+    return [_ensured(writer, recipe, shard, committed) for shard, committed in shards]
+
+
+def _ensured(writer: ShardWriter, recipe: DatasetRecipe, shard: Shard, committed: str | None) -> ManifestRow:
+    row = existing_shard(writer.group, recipe, shard)
     if row is not None and committed in (None, row.sha256):
         return row
-    return write_shard(url, recipe, shard, make_shard(recipe, shard), committed=committed)
+    meshes = make_shard(recipe, shard)
+    return writer.write(shard, meshes, bounds=sound_bounds(recipe, shard, meshes), committed=committed)
 
 
 @lru_cache(maxsize=64)

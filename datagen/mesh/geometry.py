@@ -38,7 +38,11 @@ class Box:
         return vertices * self.half[..., None, None] + self.centre[..., None, :]
 
 
-def bounds(vertices: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+Bounds = tuple[NDArray[np.floating], NDArray[np.floating]]
+"""Lowest and highest coordinates [mesh, 3] of meshes."""
+
+
+def bounds(vertices: NDArray[np.floating]) -> Bounds:
     """Lowest and highest coordinates [mesh, 3] of meshes [mesh, vertex, 3]; NaN where a mesh has any.
 
     NumPy reduces an axis before one of three numbers slowly; in groups of vertices it is some twenty times faster.

@@ -75,11 +75,11 @@ class ShardCodec:
         """The file that holds meshes [identity, pose, vertex, 3]; the cells after them are left empty."""
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
         flat = np.ascontiguousarray(meshes, "<f4").reshape(-1, self.vertices, 3)
-        chunks = [_sealed(bytes(compressor.encode(mesh))) for mesh in flat]
-        sizes = np.array([len(chunk) for chunk in chunks], np.uint64)
+        chunks = [bytes(compressor.encode(mesh)) for mesh in flat]
+        sizes = np.array([len(chunk) + _CHECKSUM.size for chunk in chunks], np.uint64)
         index = np.full((self.rows, 2), _NOTHING, "<u8")
         index[self.rows_of(*meshes.shape[:2])] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)
-        return b"".join([*chunks, _sealed(index.tobytes())])
+        return b"".join(part for chunk in (*chunks, index.tobytes()) for part in (chunk, _checksum(chunk)))
 
     def decode(self, file: bytes, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """The meshes [row, vertex, 3] of some rows of a file.
@@ -143,8 +143,8 @@ def require_plausible(decoded: int, *, stored: int) -> None:
         raise ShardDamage(f"its {decoded:,} bytes cannot be stored in {stored:,}")
 
 
-def _sealed(content: bytes) -> bytes:
-    return content + _CHECKSUM.pack(google_crc32c.value(content))
+def _checksum(content: bytes) -> bytes:
+    return _CHECKSUM.pack(google_crc32c.value(content))
 
 
 def _unsealed(content: bytes | memoryview, what: str) -> bytes:

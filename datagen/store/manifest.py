@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import UnsafeFileError, reason_of
 from datagen.grid import SPLITS, GridArrays, Place, Shard, shard_path
-from datagen.mesh.geometry import bounds
+from datagen.mesh.geometry import Bounds
 from datagen.store.arrays import put_array, put_group, read_array, read_json
 from datagen.store.object_names import is_member, require_member
 from datagen.store.objects import list_objects, read_bytes
 from datagen.store.schema import MOST_SHARDS, attributes_of
 
-_SEAL = "attributes_sha256"
+SEAL = "attributes_sha256"
 _COLUMNS = {
     "place": ("int32", (4,), ("shard", "axis")),
     "rows": ("int32", (), ("shard",)),
@@ -54,9 +54,9 @@ class ManifestRow:
         return shard_path(self.place)
 
 
-def row_of(shard: Shard, content: bytes, meshes: NDArray[np.float32]) -> ManifestRow:
-    """The row of a shard that holds meshes [..., vertex, 3] as these bytes."""
-    low, high = bounds(meshes.reshape(-1, *meshes.shape[-2:]))
+def row_of(shard: Shard, content: bytes, bounds: Bounds) -> ManifestRow:
+    """The row of a shard that holds meshes of some bounds as these bytes."""
+    low, high = bounds
     return ManifestRow(
         place=shard.place,
         rows=shard.rows,
@@ -134,16 +134,25 @@ def _hashes(digests: Iterable[str]) -> NDArray[np.uint8]:
     return np.frombuffer(bytes.fromhex("".join(digests)), np.uint8).reshape(-1, 32)
 
 
-def commit(group: zarr.Group, rows: Sequence[ManifestRow], attributes: dict[str, Any]) -> None:
-    """Write the manifest, then the root's last attributes with the digests of both."""
-    hashes = {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)}
+def commit(
+    group: zarr.Group,
+    rows: Sequence[ManifestRow],
+    attributes: dict[str, Any],
+    *,
+    objects: Mapping[str, str] | None = None,
+) -> None:
+    """Write the manifest, then the root's last attributes with the digests of both.
+
+    ``objects`` are those of the manifest before, where none but shards has been written since.
+    """
+    hashes = objects or {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)}
     manifest = manifest_of(rows, hashes)
     put_group(group, "manifest", {"objects": list(hashes)})
     put_array(group, _OBJECTS, manifest.object_hashes, ("object", "byte"))
     for name, values in manifest.columns.items():
         put_array(group, f"manifest/{name}", values, _COLUMNS[name][2])
     stated = {**attributes_of(group), **attributes, "manifest_sha256": manifest.digest()}
-    group.update_attributes({**stated, _SEAL: _digest(_without_seal(stated))})
+    group.update_attributes({**stated, SEAL: _digest(_without_seal(stated))})
 
 
 def read_manifest(group: zarr.Group) -> Manifest | None:
@@ -201,7 +210,7 @@ def covers(manifest: Manifest, arrays: GridArrays) -> bool:
 def is_sealed(group: zarr.Group) -> bool:
     """Whether the root's attributes are as :func:`commit` left them."""
     attributes = attributes_of(group)
-    return attributes.get(_SEAL) == _digest(_without_seal(attributes))
+    return attributes.get(SEAL) == _digest(_without_seal(attributes))
 
 
 def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str, str]]:
@@ -224,7 +233,7 @@ def _small_objects(group: zarr.Group) -> list[str]:
 
 
 def _without_seal(attributes: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in attributes.items() if key != _SEAL}
+    return {key: value for key, value in attributes.items() if key != SEAL}
 
 
 def _digest(content: Any) -> str:

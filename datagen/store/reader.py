@@ -19,7 +19,7 @@ from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, check_vertices, read_array
 from datagen.store.attributes import attributes_fault
 from datagen.store.codec import ShardCodec
-from datagen.store.manifest import Manifest, ManifestRow, covers, is_sealed, read_manifest
+from datagen.store.manifest import Manifest, ManifestRow, changed_objects, covers, is_sealed, read_manifest
 from datagen.store.objects import read_bytes, stored_sizes
 from datagen.store.schema import (
     attributes_of,
@@ -91,6 +91,12 @@ class Dataset:
         with self._damage():
             return stored_arrays(self.group, self.grid)
 
+    def require_unchanged(self) -> None:
+        """Refuse a dataset of which an object beside the shards is not as it was committed (DatasetError)."""
+        changed = changed_objects(self.group, self.committed) if self.committed else iter(())
+        if fault := next(changed, None):
+            raise DatasetError(f"{self.url}: {fault[0]}: {fault[1]}. {self._mend}")
+
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
         return self.grid.identities(split)
@@ -121,11 +127,15 @@ class Dataset:
     def parameters(self, identity: int) -> NDArray[np.float64]:
         """Body-model parameters [parameter] of an identity."""
         array, row = self.arrays.row_of(identity)
+        return self.parameters_along(array)[row]
+
+    def parameters_along(self, array: GridArray) -> NDArray[np.float64]:
+        """Body-model parameters [identity, parameter] along the first axis of an array; NaN in holes."""
         if array.path not in self._parameters:
             shape = len(array.identities), len(self.attributes["body"]["parameters"])
             with self._damage():
                 self._parameters[array.path] = read_array(self.group, f"{array.path}/parameters", "float64", shape)
-        return self._parameters[array.path][row]
+        return self._parameters[array.path]
 
     def rig(self, identity: int) -> Rig | None:
         """The rig of an identity; None where its body has no skeleton. Read when first asked for, then kept.
@@ -135,23 +145,30 @@ class Dataset:
         >>> world = world_rotations(dataset.rotations(), dataset.attributes["joint_parents"])
         >>> transforms = dataset.rig(0).transforms(world)  # [pose, part, 3, 4], from rest to each pose
         """
-        number = int(self._rig_numbers[identity])
+        number = int(self.rig_numbers[identity])
         if number < 0:
             return None
         if number not in self._rigs:
-            parts, count = self.attributes["rigs"][number], int((self._rig_numbers == number).sum())
-            vertices = self.arrays.vertices[self.arrays.topologies[identity]]
-            with self._damage():
-                self._rigs[number] = stored_rigs(self.group, number, parts, identities=count, vertices=vertices)
-        return self._rigs[number][int((self._rig_numbers[:identity] == number).sum())]
+            self._rigs[number] = self.rigs(number)
+        return self._rigs[number][int((self.rig_numbers[:identity] == number).sum())]
 
-    def check_rigs(self) -> None:
-        """Read every rig (DatasetError where one is not as the format has it)."""
-        for identity in np.unique(self._rig_numbers, return_index=True)[1].tolist():
-            self.rig(identity)
+    def rigs(self, number: int) -> Rigs:
+        """The rigs of all identities whose bodies have the parts of a number; nothing of them is kept.
+
+        Raises
+        ------
+        DatasetError
+            They are not as the format has them.
+        """
+        identities = np.flatnonzero(self.rig_numbers == number)
+        vertices = self.arrays.vertices[self.arrays.topologies[identities[0]]] if len(identities) else 0
+        parts = self.attributes["rigs"][number]
+        with self._damage():
+            return stored_rigs(self.group, number, parts, identities=len(identities), vertices=vertices)
 
     @cached_property
-    def _rig_numbers(self) -> NDArray[np.int32]:
+    def rig_numbers(self) -> NDArray[np.int32]:
+        """Number [identity] of each identity's rig in the attribute ``rigs``; -1 where its body has none."""
         with self._damage():
             return stored_rig_numbers(self.group, self.arrays, len(self.attributes["rigs"]))
 

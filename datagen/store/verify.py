@@ -19,7 +19,7 @@ from datagen.store.manifest import Manifest, ManifestRow, changed_objects, cover
 from datagen.store.objects import read_bytes, stored_sizes
 from datagen.store.reader import Dataset, damage_of
 from datagen.store.schema import OLDEST_RECIPE, attributes_of, check_version, open_group, stored_recipe
-from datagen.store.writer import existing_shard
+from datagen.store.writer import decoded, existing_shard
 
 
 @dataclass(frozen=True)
@@ -59,36 +59,42 @@ def _shard_faults(dataset: Dataset, manifest: Manifest, arrays: GridArrays | Non
     """The fault of every shard; which there are is known from the grid's arrays, or else from the manifest."""
     rows = {row.place: row for row in manifest.shards}
     if arrays is None:
-        reasons = ((row.path, _changed(dataset.group, row)) for row in manifest.shards)
+        reasons = ((row.path, _committed(dataset.group, row)[1]) for row in manifest.shards)
     else:
-        reasons = ((shard.path, _fault(dataset, shard, rows.get(shard.place))) for shard in arrays.shards())
+        shards = (shard for array in arrays.arrays for shard in array.shards())
+        reasons = ((shard.path, _fault(dataset, shard, rows.get(shard.place))) for shard in shards)
     for path, reason in reasons:
         yield Fault(path, reason, shard=True) if reason else None
 
 
 def _fault(dataset: Dataset, shard: Shard, row: ManifestRow | None) -> str | None:
-    reason = _changed(dataset.group, row) if row else None
-    if reason or existing_shard(dataset.group, dataset.recipe, shard):
+    """Why a shard is not as it was committed; where none was, why it is not whole."""
+    if row is None:
+        return None if existing_shard(dataset.group, dataset.recipe, shard) else "missing or damaged"
+    content, reason = _committed(dataset.group, row)
+    if content is None:
         return reason
-    return "cannot be decoded" if row else "missing or damaged"
+    return None if decoded(content, dataset.recipe, shard) is not None else "cannot be decoded"
+
+
+def _committed(group: zarr.Group, row: ManifestRow) -> tuple[bytes | None, str | None]:
+    """The bytes of a shard, None where they are not those that were committed, and why not."""
+    try:
+        content = read_bytes(group, row.path, limit=row.bytes)
+    except (OSError, UnsafeFileError) as error:
+        return None, f"cannot be read ({reason_of(error)})"
+    if content is None:
+        return None, "missing"
+    if len(content) != row.bytes:
+        return None, f"{len(content)} bytes instead of {row.bytes}"
+    if hashlib.sha256(content).hexdigest() != row.sha256:
+        return None, "its sha256 is not the manifest's"
+    return content, None
 
 
 def _arrays(dataset: Dataset) -> GridArrays | None:
     """The dataset's arrays of vertices; None where what says so is damaged, which is a fault of its own."""
     return None if damage_of(lambda: dataset.arrays) else dataset.arrays
-
-
-def _changed(group: zarr.Group, row: ManifestRow) -> str | None:
-    """Why a shard is not as it was committed."""
-    try:
-        content = read_bytes(group, row.path, limit=row.bytes)
-    except (OSError, UnsafeFileError) as error:
-        return f"cannot be read ({reason_of(error)})"
-    if content is None:
-        return "missing"
-    if len(content) != row.bytes:
-        return f"{len(content)} bytes instead of {row.bytes}"
-    return None if hashlib.sha256(content).hexdigest() == row.sha256 else "its sha256 is not the manifest's"
 
 
 def _root_faults(dataset: Dataset) -> Iterator[Fault]:
@@ -103,7 +109,8 @@ def _root_faults(dataset: Dataset) -> Iterator[Fault]:
 
 def _misfits(dataset: Dataset) -> Iterator[Fault]:
     """Arrays that are as they were committed, and yet not as the format has them."""
-    reads: list[Callable[[], Any]] = [lambda: dataset.arrays, dataset.rotations, dataset.check_rigs]
+    reads: list[Callable[[], Any]] = [lambda: dataset.arrays, dataset.rotations, lambda: dataset.rig_numbers]
+    reads += [partial(dataset.rigs, number) for number in range(len(dataset.attributes["rigs"]))]
     reads += [partial(dataset.evaluation_triples, pose_type) for pose_type in POSE_TYPES]
     arrays = _arrays(dataset)
     for array in arrays.arrays if arrays else ():

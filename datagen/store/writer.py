@@ -5,7 +5,7 @@ are not there yet, a shard is written once and whole by one task, and ``status: 
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,12 +14,14 @@ import zarr
 from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError, NoDataset, ShardDamage, UnsafeFileError, storage_errors
-from datagen.grid import HOLE, GridArray, GridArrays, PoseType, Shard
+from datagen.grid import HOLE, Grid, GridArray, GridArrays, PoseType, Shard
+from datagen.mesh.geometry import Bounds
+from datagen.mesh.geometry import bounds as bounds_of
 from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
-from datagen.store.arrays import put_array, put_group, put_vertices_metadata
+from datagen.store.arrays import ArrayDamage, put_array, put_group, put_vertices_metadata, read_json
 from datagen.store.attributes import check_same_assets, check_same_recipe, with_history
-from datagen.store.manifest import ManifestRow, commit, read_manifest, row_of
+from datagen.store.manifest import SEAL, ManifestRow, changed_objects, commit, is_sealed, read_manifest, row_of
 from datagen.store.object_names import MEMBERS
 from datagen.store.objects import delete_object, list_objects, read_bytes, stored_sizes, write_bytes
 from datagen.store.schema import (
@@ -30,6 +32,7 @@ from datagen.store.schema import (
     codec_of,
     create_group,
     open_group,
+    stored_arrays,
 )
 
 SmallArray = tuple[str, NDArray[Any], tuple[str, ...]]
@@ -108,7 +111,14 @@ class Plan:
         yield f"{array.path}/parameters", parameters, ("identity", "parameter")
 
 
-def begin(url: str, plan: Plan, *, growing: bool = False, lost: Sequence[str] = ()) -> None:
+def begin(
+    url: str,
+    plan: Plan,
+    *,
+    growing: bool = False,
+    lost: Sequence[str] = (),
+    rows: Sequence[ManifestRow] | None = None,
+) -> None:
     """Create the dataset, or whatever an interrupted ``begin`` left out of it.
 
     Parameters
@@ -117,6 +127,9 @@ def begin(url: str, plan: Plan, *, growing: bool = False, lost: Sequence[str] = 
         A complete dataset is there, of the recipe before its last step: from here on it is one in the making.
     lost
         Objects other than shards that were lost or changed, to be made again.
+    rows
+        The shards that are there and sound, which are committed with the objects: a run after an interruption then
+        knows them. None: the manifest stays as it is.
 
     Raises
     ------
@@ -143,6 +156,13 @@ def begin(url: str, plan: Plan, *, growing: bool = False, lost: Sequence[str] = 
             if path != "zarr.json":
                 delete_object(group, path)
         _put_arrays(group, plan)
+        if rows is not None and _is_building(as_it_is_now := open_group(url, mode="r+")):
+            commit(as_it_is_now, rows, {})
+
+
+def _is_building(group: zarr.Group) -> bool:
+    """Whether nobody has completed it meanwhile, as on a store without a lock."""
+    return attributes_of(group).get("status") == "building"
 
 
 def _opened(url: str, attributes: dict[str, Any], *, growing: bool) -> zarr.Group:
@@ -166,58 +186,132 @@ def _put_arrays(group: zarr.Group, plan: Plan) -> None:
         put_vertices_metadata(group, array, codec_of(plan.recipe, array))
 
 
-def require_driven(url: str, recipe: DatasetRecipe) -> zarr.Group:
-    """The dataset's group, if it is still the one that a task was sent to make.
+class ShardWriter:
+    """Writes shards of the dataset at ``url``, for as long as it is still the one that a task was sent to make.
 
     Raises
     ------
     DatasetError
-        It has been removed, or begun anew by another recipe.
+        It has been removed, or begun anew by another recipe; also later, before anything is written.
     """
-    group = open_group(url, mode="r+")
-    if attributes_of(group).get("recipe_sha256") != recipe.sha256():
-        raise DatasetError(f"{url} is being made by another recipe now; this task leaves it alone. Run one at a time")
-    return group
 
+    def __init__(self, url: str, recipe: DatasetRecipe) -> None:
+        self.group, self._url, self._recipe = open_group(url, mode="r+"), url, recipe
+        self._sha256 = recipe.sha256()
+        self._require_driven()
 
-def write_shard(
-    url: str, recipe: DatasetRecipe, shard: Shard, vertices: NDArray[np.float32], *, committed: str | None = None
-) -> ManifestRow:
-    """Write one whole shard, vertices [identity, pose, vertex, 3], and return its manifest row.
+    def _require_driven(self) -> None:
+        """Look at its root as it is now: another process may have begun another dataset."""
+        try:
+            attributes = read_json(self.group, "zarr.json").get("attributes")
+        except ArrayDamage:
+            attributes = None
+        if not isinstance(attributes, dict) or attributes.get("recipe_sha256") != self._sha256:
+            raise DatasetError(
+                f"{self._url} is being made by another recipe now; this task leaves it alone. Run one at a time"
+            )
 
-    Raises
-    ------
-    DatasetError
-        The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its array's
-        shape; nothing is written then.
-    """
-    group, expected = require_driven(url, recipe), (len(shard.identities), len(shard.poses), shard.vertices, 3)
-    if vertices.shape != expected:
-        raise DatasetError(f"{url}: shard {shard.path} came out of shape {vertices.shape} instead of {expected}")
-    content = codec_of(recipe, shard).encode(vertices)
-    row = row_of(shard, content, vertices)
-    if committed not in (None, row.sha256):
-        raise DatasetError(
-            f"{url}: shard {shard.path} was made again, but not the same: other package versions made it "
-            f"(dsffnet inspect {url} names them). Install those, or make the dataset anew with --fresh"
-        )
-    with _writing(url):
-        write_bytes(group, shard.path, content)
-        if stored_sizes(group, [shard.path]) != {shard.path: len(content)}:
-            raise DatasetError(f"{url}: shard {shard.path} is not there as it was written; is the storage sound?")
-    return row
+    def write(
+        self, shard: Shard, vertices: NDArray[np.float32], *, bounds: Bounds, committed: str | None = None
+    ) -> ManifestRow:
+        """Write one whole shard, vertices [identity, pose, vertex, 3] of some bounds, and return its manifest row.
+
+        Raises
+        ------
+        DatasetError
+            The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its
+            array's shape; nothing is written then.
+        """
+        expected = (len(shard.identities), len(shard.poses), shard.vertices, 3)
+        if vertices.shape != expected:
+            raise DatasetError(
+                f"{self._url}: shard {shard.path} came out of shape {vertices.shape} instead of {expected}"
+            )
+        content = codec_of(self._recipe, shard).encode(vertices)
+        row = row_of(shard, content, bounds)
+        if committed not in (None, row.sha256):
+            raise DatasetError(
+                f"{self._url}: shard {shard.path} was made again, but not the same: other package versions made it "
+                f"(dsffnet inspect {self._url} names them). Install those, or make the dataset anew with --fresh"
+            )
+        self._require_driven()
+        with _writing(self._url):
+            write_bytes(self.group, shard.path, content)
+            if stored_sizes(self.group, [shard.path]) != {shard.path: len(content)}:
+                raise DatasetError(
+                    f"{self._url}: shard {shard.path} is not there as it was written; is the storage sound?"
+                )
+        return row
 
 
 def existing_shard(group: zarr.Group, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:
     """The manifest row of a shard that is there, whole and sound; None where it is missing, damaged or unreadable."""
+    try:
+        content = read_bytes(group, shard.path, limit=codec_of(recipe, shard).most_bytes)
+    except (OSError, UnsafeFileError):
+        return None
+    meshes = None if content is None else decoded(content, recipe, shard)
+    return None if content is None or meshes is None else row_of(shard, content, bounds_of(meshes))
+
+
+def decoded(content: bytes, recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32] | None:
+    """The meshes [mesh, vertex, 3] that a shard's bytes hold; None where they are damaged."""
     codec = codec_of(recipe, shard)
     try:
-        content = read_bytes(group, shard.path, limit=codec.most_bytes)
-        if content is None:
-            return None
-        return row_of(shard, content, codec.decode(content, codec.rows_of(len(shard.identities), len(shard.poses))))
-    except (ShardDamage, OSError, UnsafeFileError):
+        return codec.decode(content, codec.rows_of(len(shard.identities), len(shard.poses)))
+    except ShardDamage:
         return None
+
+
+def begun(url: str, recipe: DatasetRecipe, attributes: Mapping[str, Any]) -> GridArrays | None:
+    """Where the meshes go of a dataset of which all but shards is there, as it was written; None where it is not.
+
+    Raises
+    ------
+    DatasetError
+        A dataset of another recipe or of another version is there.
+    """
+    try:
+        group = open_group(url)
+    except NoDataset:
+        return None
+    check_same_recipe(url, group, recipe)
+    present, manifest = attributes_of(group), read_manifest(group)
+    if manifest is None or not manifest.objects or not is_sealed(group) or any(changed_objects(group, manifest)):
+        return None
+    if any(present.get(key) != value for key, value in attributes.items()):
+        return None
+    try:
+        return stored_arrays(group, Grid(recipe))
+    except ArrayDamage:
+        return None
+
+
+def vouched_rows(url: str, faulty: Collection[str] = ()) -> list[ManifestRow] | None:
+    """The manifest rows of shards that need not be looked at: they are there, of the size that was written.
+
+    None where the manifest is not to be believed: its attributes were changed, or it is among the ``faulty`` objects.
+    """
+    try:
+        group = open_group(url)
+    except NoDataset:
+        return []
+    believed = is_sealed(group) or SEAL not in attributes_of(group)
+    if not believed or any(path == "zarr.json" or path.startswith("manifest/") for path in faulty):
+        return None
+    manifest = read_manifest(group)
+    rows = [row for row in manifest.shards if row.path not in faulty] if manifest else []
+    sizes = stored_sizes(group, [row.path for row in rows])
+    return [row for row in rows if sizes.get(row.path) == row.bytes]
+
+
+def save(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
+    """Commit a manifest of the shards so far, so that a run after an interruption knows them without reading them."""
+    with _writing(url):
+        group = ShardWriter(url, recipe).group
+        manifest = read_manifest(group)
+        if manifest and is_sealed(group) and _is_building(group):
+            commit(group, rows, {}, objects=manifest.objects)
 
 
 def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
@@ -235,7 +329,7 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
         "maximum": np.max([row.maximum for row in rows], axis=0).tolist(),
     }
     with _writing(url):
-        group = require_driven(url, recipe)
+        group = ShardWriter(url, recipe).group
         sizes = stored_sizes(group, [row.path for row in rows])
         for row in rows:
             if sizes.get(row.path) != row.bytes:
@@ -243,7 +337,9 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
         for path in list_objects(group):
             if path.endswith(".partial"):
                 delete_object(group, path)
-        commit(group, rows, {"statistics": statistics, "status": "complete"})
+        manifest = read_manifest(group) if is_sealed(group) else None
+        objects = manifest.objects if manifest else None
+        commit(group, rows, {"statistics": statistics, "status": "complete"}, objects=objects)
 
 
 def committed_hashes(url: str) -> dict[str, str]:

@@ -2,20 +2,21 @@
 
 import json
 from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 from datagen.common.errors import DsffnetError
 from datagen.common.files import write_atomically
 from datagen.generate import generate
-from datagen.grid import Grid
 from datagen.recipe import DatasetRecipe
-from datagen.store import ManifestRow, open_dataset
+from datagen.store import open_dataset
 from datagen.store.verify import describe
-from training.reports.contact_sheet import draw_contact_sheet
 from training.tracking.record import about_dataset, has_record, update_record
 from workflows.pipeline.progress import bar, sampling
 from workflows.pipeline.run_folder import WorkflowFolder
 from workflows.pipeline.stage import Stage, recorded
 from workflows.pipeline.tasks import TaskRunner
+
+Result = TypeVar("Result")
 
 
 def generate_stage(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> Stage:
@@ -30,6 +31,8 @@ def generate_stage(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRun
 
 def generate_dataset(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskRunner) -> None:
     """Make the dataset, its description and a contact sheet of it, and record it."""
+    from training.reports.contact_sheet import draw_contact_sheet  # matplotlib
+
     out, parameters = folder.generate, recipe.model_dump(mode="json")
     with recorded(out, kind="generate", name="generate", parent=folder.path, parameters=parameters):
         with sampling(out / "system.jsonl"):
@@ -45,12 +48,12 @@ def generate_dataset(recipe: DatasetRecipe, folder: WorkflowFolder, tasks: TaskR
         )
 
 
-def generation_bar(rows: Iterable[ManifestRow], grid: Grid) -> Iterator[ManifestRow]:
-    """A bar that counts meshes while shards come in."""
-    with bar(total=grid.mesh_count, what="generate", unit="mesh") as shown:
-        for row in rows:
-            shown.update(row.rows)
-            yield row
+def generation_bar(results: Iterable[tuple[int, Result]], *, unit: str, total: int, done: int) -> Iterator[Result]:
+    """A bar that counts what is made, which is shown from the first second; see :data:`datagen.generate.Progress`."""
+    with bar(total=total, initial=done, what="generate", unit=unit) as shown:
+        for amount, result in results:
+            shown.update(amount)
+            yield result
 
 
 def is_complete(data: str) -> bool:

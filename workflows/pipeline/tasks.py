@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
-from datagen.generate import Runner, Task, ensure_shard, inline, ray_runner
+from datagen.generate import Runner, Task, ensure_shards, inline, ray_runner
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset
-from training.evaluation.evaluate import POSE_TYPES, evaluation_list
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
 from workflows.pipeline.ray_cluster import on_cluster, ray_cluster
 
@@ -55,15 +54,21 @@ class TaskRunner:
 
     def make_shards(self, task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         """Run the tasks of :func:`datagen.generate.generate`."""
-        if task is not ensure_shard:  # a single one, of what comes before the shards
-            return self._run(task, arguments, here=not on_cluster())
-        meshes = sum(shard.rows for _, _, shard, committed in arguments if committed is None)
-        least = ray_from(arguments[0][1]) if arguments else RAY_FROM_MESHES
-        here = self._decide("generate", meshes, "meshes", least)
+        if not arguments:
+            return iter(())
+        if task is ensure_shards:
+            meshes = sum(shard.rows for _, _, some in arguments for shard, _ in some)
+            here = self._decide("generate", meshes, "meshes", ray_from(arguments[0][1]))
+        else:  # what comes before the shards; a number is as much work as a mesh or so
+            numbers = sum(len(numbers) for _, _, *given in arguments for numbers in given)
+            many = numbers >= RAY_FROM_MESHES
+            here = self._decide("generate", numbers, "numbers to draw", RAY_FROM_MESHES) if many else not on_cluster()
         return self._run(task, arguments, here=here)
 
     def measure(self, dataset: Dataset, recipe: EvaluationRecipe) -> Runner:
         """The runner for :func:`training.evaluation.evaluate.evaluate`."""
+        from training.evaluation.evaluate import POSE_TYPES, evaluation_list  # torch, which making data does without
+
         listed = [evaluation_list(dataset, recipe, pose_type) for pose_type in POSE_TYPES]
         vertices = sum(dataset.vertex_count(int(triple[2])) for triples in listed for triple in triples)
         here = self._decide("evaluate", vertices, "vertices", RAY_FROM_VERTICES)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from datagen.bodies import FAMILIES, load_body
 from datagen.common.errors import MeshError, RecipeError
 from datagen.common.files import write_atomically
-from datagen.generate.plan import identity_parameters
+from datagen.generate.identities import identity_parameters
 from datagen.mesh.files import MeshFile, check_writable, read_mesh_file, save_mesh
 from datagen.mesh.formats.gltf import SUFFIXES
 from datagen.mesh.geometry import Mesh

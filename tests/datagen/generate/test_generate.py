@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from datagen import generate as generation
 from datagen.common.errors import BodyError, DatasetError
-from datagen.generate import generate, inline, make_shard, prepare, shards
+from datagen.generate import ensure_shards, generate, inline, make_shard, shards
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
 from datagen.store.verify import find_faults
@@ -30,16 +30,18 @@ class Interrupted(Exception):
 
 
 def interrupted_runner(order: list[int], stop_after: int) -> generation.Runner:
-    """Runs shards in a given order and dies after some of them."""
+    """Makes shards one by one in a given order and dies after some of them."""
 
     def run(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
-        if task is prepare:
+        if task is not ensure_shards:
             yield from inline(task, arguments)
             return
-        for count, place in enumerate(order):
+        alone = [(url, recipe, [wanted]) for url, recipe, some in arguments for wanted in some]
+        for count, place in enumerate(place for place in order if place < len(alone)):
             if count == stop_after:
                 raise Interrupted
-            yield task(*arguments[place])
+            yield task(*alone[place])
+        raise Interrupted
 
     return run
 

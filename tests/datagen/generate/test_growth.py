@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datagen.common.errors import DatasetError
-from datagen.generate import append, ensure_shard, generate, inline
+from datagen.generate import append, ensure_shards, generate, inline
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
@@ -73,10 +73,13 @@ def test_interrupted_it_goes_on_with_the_same_call(spoilable: Path, tmp_path: Pa
     append(str(other), seen=9, training=4)
 
     def dying(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
-        for number, row in enumerate(inline(task, arguments)):
-            if task is ensure_shard and number >= 12 + stop_after:
+        if task is not ensure_shards:
+            yield from inline(task, arguments)
+            return
+        for number, wanted in enumerate(wanted for _, _, some in arguments for wanted in some):
+            if number >= stop_after:
                 raise Interrupted
-            yield row
+            yield task(*arguments[0][:2], [wanted])
 
     with pytest.raises(Interrupted):
         append(str(spoilable), seen=9, training=4, run=dying)

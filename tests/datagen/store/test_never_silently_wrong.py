@@ -11,14 +11,15 @@ import pytest
 from datagen.bodies.leg import LegModel
 from datagen.common.assets import Asset
 from datagen.common.errors import BodyError, DatasetError
-from datagen.generate import append, ensure_shard, generate, make_shard, repair
+from datagen.generate import append, ensure_shards, generate, make_shard, repair
 from datagen.generate.plan import plan_of
 from datagen.generate.shards import require_same_assets
+from datagen.mesh.geometry import bounds
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
-from datagen.store.writer import write_shard
+from datagen.store.writer import ShardWriter
 from tests.support.files import tree_hash
 from tests.support.recipes import shards_of, tiny_dataset
 from tests.support.shapes.meshes import npt_folder
@@ -46,9 +47,9 @@ def test_vertices_that_are_in_no_face_are_kept(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_shard_of_another_shape_is_not_written(spoilable: Path) -> None:
-    shard, before = shards_of(tiny_dataset())[0], tree_hash(spoilable)
+    shard, before, other = shards_of(tiny_dataset())[0], tree_hash(spoilable), np.zeros((1, 4, 31, 3), np.float32)
     with pytest.raises(DatasetError, match=r"of shape \(1, 4, 31, 3\) instead of \(1, 4, 32, 3\)"):
-        write_shard(str(spoilable), tiny_dataset(), shard, np.zeros((1, 4, 31, 3), np.float32))
+        ShardWriter(str(spoilable), tiny_dataset()).write(shard, other, bounds=bounds(other[0]))
     assert tree_hash(spoilable) == before
 
 
@@ -71,9 +72,9 @@ def test_a_complete_dataset_of_other_files_is_not_taken_for_this_one(tmp_path: P
 def test_a_late_task_of_another_recipe_writes_nothing(spoilable: Path) -> None:
     before, shard = tree_hash(spoilable), shards_of(OTHER)[0]
     with pytest.raises(DatasetError, match="is being made by another recipe now"):
-        ensure_shard(str(spoilable), OTHER, shard)
+        ensure_shards(str(spoilable), OTHER, [(shard, None)])
     with pytest.raises(DatasetError, match="is being made by another recipe now"):
-        write_shard(str(spoilable), OTHER, shard, make_shard(OTHER, shard))
+        ShardWriter(str(spoilable), OTHER)
     assert tree_hash(spoilable) == before
 
 
@@ -180,7 +181,7 @@ def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch:
     (spoilable / shard.path).unlink()
     monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "OTHER"),))
     with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg OTHER"):
-        ensure_shard(str(spoilable), tiny_dataset(), shard)
+        ensure_shards(str(spoilable), tiny_dataset(), [(shard, None)])
     assert not (spoilable / shard.path).exists()
 
 

@@ -181,7 +181,7 @@ def test_s3_that_goes_away_in_the_middle(
 
     def killing(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         for number, row in enumerate(inline(task, arguments)):
-            if task is generation.ensure_shard and number == 2:
+            if task is generation.ensure_shards and number == 2:
                 server.kill()
                 server.wait()
             yield row

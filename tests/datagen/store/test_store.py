@@ -10,12 +10,11 @@ import pytest
 import zarr
 
 from datagen.common.errors import DatasetError, StorageError
-from datagen.generate import generate, make_shard, repair
+from datagen.generate import ensure_shards, generate, make_shard, repair
 from datagen.store import open_dataset
 from datagen.store.codec import ShardCodec
 from datagen.store.schema import attributes_of, open_group
 from datagen.store.verify import describe, find_faults
-from datagen.store.writer import write_shard
 from tests.support.files import flip_bit, tree_hash, truncate
 from tests.support.layout import layout
 from tests.support.recipes import shards_of, tiny_dataset
@@ -299,7 +298,7 @@ def test_disk_full_is_one_error_and_earlier_shards_stay(spoilable: Path, monkeyp
 
     monkeypatch.setattr(local, "_put", full)
     with pytest.raises(StorageError, match="No space left on device"):
-        write_shard(str(spoilable), tiny_dataset(), shard, make_shard(tiny_dataset(), shard))
+        ensure_shards(str(spoilable), tiny_dataset(), [(shard, None)])
     monkeypatch.undo()
     assert tree_hash(spoilable) == before
 

@@ -70,6 +70,15 @@ def test_a_large_one_is_made_on_ray_which_ends_with_the_block(
     assert len(ray_starts) == 3 and "in this process (--local)" in capsys.readouterr().err
 
 
+def test_many_identities_are_described_on_ray(
+    tmp_path: Any, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 10)
+    with TaskRunner() as runner:
+        generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
+    assert ray_starts.count("tasks") == 2  # ten poses and the shards, but not five identities
+
+
 def test_meshes_that_take_long_are_worth_rays_start_sooner() -> None:
     dressed = DatasetRecipe.model_validate({"body": {"family": "clothed"}})
     assert tasks.ray_from(tiny_dataset()) == 5_000
@@ -97,7 +106,7 @@ def test_on_a_cluster_everything_goes_there(
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     with TaskRunner() as runner:
         generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
-    assert ray_starts.count("tasks") == 2  # the preparation, and the shards
+    assert ray_starts.count("tasks") == 4  # the head, identities, poses, shards
 
 
 def test_few_triples_are_measured_here(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from datagen.bodies import load_body
 from datagen.characters.character import load_character
 from datagen.common.errors import DsffnetError
-from datagen.generate.plan import identity_parameters
+from datagen.generate.identities import identity_parameters
 from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh, vertex_normals
 from datagen.mesh.rig import part_transforms, skinned
