@@ -98,7 +98,7 @@ def simulate(work: Work, shards: int, *, nodes: int, cpus: int = 16) -> Outcome:
 
 
 # Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md), FINISH (benchmarks.driver).
-# Assumed: DRIVER, until benchmarks.driver has had a quiet machine.
+# Assumed: DRIVER; benchmarks.driver measures it.
 DRIVER, FINISH = 1.0e-3, 0.165e-3
 # Assumed: a node of 16 CPUs with 12.5 Gbit/s; 3,500 objects written a second below one prefix, whatever their size.
 CPUS, NETWORK, PUTS = 16, 12.5e9 / 8, 3500

@@ -5,7 +5,6 @@ only the .glb files are unpacked, and nothing of the package's code is installed
 """
 
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from datagen.common.errors import BodyError, UnsafeFileError, storage_errors
-from datagen.common.files import sha256_of
+from datagen.common.files import sha256_of, write_atomically
 
 LICENCE = "CC0-1.0"
 SHA256 = {
@@ -72,13 +71,16 @@ def write_animals(folder: Path) -> list[Path]:
     Raises
     ------
     BodyError, StorageError
-        As :func:`animal_files`; the folder cannot be written to.
+        As :func:`animal_files`; another file of such a name is there, or the folder cannot be written to.
     """
     copies = {file: folder / file.name for file in animal_files()}
     with storage_errors(f"the animals to {folder}", advice="Choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
         for file, copy in copies.items():
-            shutil.copyfile(file, copy)
+            content = file.read_bytes()
+            if copy.exists() and copy.read_bytes() != content:
+                raise BodyError(f"{copy} is another file than the animal of that name. Choose another --out")
+            write_atomically(copy, content)
     return list(copies.values())
 
 

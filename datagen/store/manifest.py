@@ -151,8 +151,9 @@ def commit(
     put_array(group, _OBJECTS, manifest.object_hashes, ("object", "byte"))
     for name, values in manifest.columns.items():
         put_array(group, f"manifest/{name}", values, _COLUMNS[name][2])
-    stated = {**attributes_of(group), **attributes, "manifest_sha256": manifest.digest()}
-    group.update_attributes({**stated, SEAL: _digest(_without_seal(stated))})
+    others = {name: value for name, value in attributes_of(group).items() if name not in ("manifest_sha256", SEAL)}
+    stated = {**others, **attributes, "manifest_sha256": manifest.digest()}
+    group.attrs.put({**stated, SEAL: _digest(stated)})  # these two last, whenever they were written first
 
 
 def read_manifest(group: zarr.Group) -> Manifest | None:

@@ -286,11 +286,13 @@ class Dataset:
 
     def _index(self, path: str, codec: ShardCodec) -> NDArray[np.uint64]:
         """The index of a shard, kept: a mesh that is read alone then takes one read."""
-        if path not in self._indexes:
-            if len(self._indexes) >= _MOST_INDEXES:
+        index = self._indexes.get(path)
+        if index is None:
+            index = codec.decode_index(self._bytes(path, SuffixByteRequest(codec.index_bytes)))
+            if len(self._indexes) >= _MOST_INDEXES:  # another thread may clear them at any time
                 self._indexes.clear()
-            self._indexes[path] = codec.decode_index(self._bytes(path, SuffixByteRequest(codec.index_bytes)))
-        return self._indexes[path]
+            self._indexes[path] = index
+        return index
 
     def _bytes(self, path: str, byte_range: ByteRequest | None = None) -> bytes:
         try:

@@ -22,7 +22,7 @@ _T = TypeVar("_T")
 PATIENCE = 60.0
 """Seconds for which a remote store that does not answer is asked again."""
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 8.0
-_LISTED_FROM = 32  # sizes; a listing costs as much as a dozen requests for one
+_LISTED_FROM = 32  # so many sizes; a listing is a request for each thousand objects
 S3_OPTIONS: dict[str, Any] = {
     "config_kwargs": {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 0}}
 }

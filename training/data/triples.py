@@ -118,7 +118,8 @@ class Strips:
     ) -> NDArray[np.int64]:
         """Another than each of ``of`` [n], from its strip or another one of its group.
 
-        Over all lists each other is drawn alike often, where strips are equally long.
+        Over all lists each other is drawn alike often, where strips are equally long; what lies in a shorter one a
+        little less often.
 
         Parameters
         ----------
@@ -135,7 +136,9 @@ class Strips:
         elsewhere = lists[which, next_to]
         there = self._starts[elsewhere] + random.integers(0, self.sizes[elsewhere])
         here = self._starts[strip] + (self._place[of] + 1 + random.integers(0, np.maximum(size - 1, 1))) % size
-        return self._members[np.where(random.random(len(of)) * (count - 1) < size - 1, here, there)]
+        away = (count - size) / max(count - 1, 1) * self.sizes[elsewhere] / self.sizes.max()
+        is_away = random.random(len(of)) < np.where(size == 1, 1.0, away)  # one that is alone has nothing else here
+        return self._members[np.where(is_away, there, here)]
 
 
 @dataclass(frozen=True)
@@ -176,14 +179,14 @@ class BlockOrder(TripleOrder):
     lanes as a whole read each tile once, all together, and the triples do not depend on how many ranks there are.
 
     As in the full shuffle, each cell (target identity, source pose) is the truth once an epoch, and any single triple
-    has the same distribution, where shards are equally large. (Else a pose of a smaller shard is the target's more
-    often, by as much as it is smaller, and so is an identity the source's.) What differs: triples that are near in the
-    order share identities and poses.
+    has the same distribution, where shards are equally large. (Else a pose of a smaller shard is the target's somewhat
+    less often, and so is an identity the source's.) What differs: triples that are near in the order share identities
+    and poses.
 
     Raises
     ------
     RecipeError
-        The block is too small for its four tiles.
+        The block is too small for its four tiles, or all meshes take no more than these.
     """
 
     block: Block
@@ -191,6 +194,11 @@ class BlockOrder(TripleOrder):
     def __post_init__(self) -> None:
         super().__post_init__()
         least = int(_HELD_TILES * self.block.tile) + 1
+        if self.block.meshes < least and least >= self.cells:
+            raise RecipeError(
+                f"training.block is for data larger than memory, but all {self.cells:,} meshes take "
+                f"{bytes_text(self.cells * self.block.mesh_bytes)}: leave it out"
+            )
         if self.block.meshes < least:
             raise RecipeError(
                 f"training.block holds {self.block.meshes:,} meshes of {bytes_text(self.block.mesh_bytes)}, but "

@@ -99,7 +99,7 @@ def process_group(ranks: Ranks, recipe: TrainingRecipe) -> Iterator[None]:
 
 def is_of_the_group(error: BaseException) -> bool:
     """Whether an error is the process group's: of Gloo, of NCCL, or of the store where the ranks meet."""
-    return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error).lower())
+    return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo/" in str(error).lower())
 
 
 @contextlib.contextmanager

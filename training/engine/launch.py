@@ -35,6 +35,7 @@ _LOST = (
     "another rank has ended, or its host cannot be reached ({}). Run the same command again on every host: it resumes "
     "from the newest checkpoint"
 )
+_WHERE_THEY_MEET = ("EADDRINUSE", "Unable to find address")  # the same command fails the same way
 _ASK_SECONDS = 60.0  # that a cluster has to say whether its torch uses its GPUs
 
 
@@ -272,7 +273,8 @@ def main() -> None:
         if not is_of_the_group(error):
             raise
         reason = re.sub(r"^\[[^]]*\] ", "", reason_of(error))  # the line of Gloo's source
-        print(f"error: {_LOST.format(printable(reason))}", file=sys.stderr)
+        is_misnamed = any(words in reason for words in _WHERE_THEY_MEET)
+        print(f"error: {printable(reason) if is_misnamed else _LOST.format(printable(reason))}", file=sys.stderr)
         status = 1
     sys.stdout.flush()
     sys.stderr.flush()

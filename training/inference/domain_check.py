@@ -134,7 +134,7 @@ def remarks(
         yield from _about_parts(name, mesh)
     yield from _about_box(name, upright, seen if fits else None)
     if isinstance(axes, Standing):  # a network that reads a sample of the surface does not mind how many there are
-        yield from _about_few(name, upright, seen)
+        yield from _about_few(name, mesh.vertices, seen)
     else:
         yield from _about_count(name, len(upright), seen)
 

@@ -31,7 +31,7 @@ _OPTION = re.compile(r"(?<!\S)--([a-z]+)(=?)")
 _PMD = "PMD: mean square of {} in the truth's box, boxes centred alike"
 _MISFIT = (
     "*misfit*: how badly the weights understand a mesh: what is left where each part is its rest, turned, a mean of "
-    "squares in the mesh' box. Bodies like those of training have 0.002 or less."
+    "squares in the mesh's box. Bodies like those of training have 0.002 or less."
 )
 _BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
 

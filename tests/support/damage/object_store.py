@@ -61,7 +61,7 @@ def proxied(log: Path, *, delay: float = 0.0, busy_every: int = 0, lost_every: i
     delay
         Seconds that each request waits.
     busy_every, lost_every
-        Every so manieth request is answered by 503, or by a reset: in turn before and within the answer. 0: none.
+        One request of so many is answered by 503, or by a reset: in turn before and within the answer. 0: none.
     """
     port, behind = free_port(), os.environ["AWS_ENDPOINT_URL"].rsplit(":", 1)[1]
     log.touch()

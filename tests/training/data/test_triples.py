@@ -173,9 +173,26 @@ def test_lanes_are_whole_parts_of_a_batch_that_ranks_share() -> None:
     assert TripleOrder(range(3), range(7), batch=8, seed=0).memory() is None
 
 
-def test_a_block_that_is_too_small_for_the_shards_is_refused() -> None:
-    with pytest.raises(RecipeError, match=r"block holds 30 meshes of 0.4 kB, but 4 tiles .* have 65. Set it to .* or"):
-        blocks(identities=8, poses=8, height=2, width=2, held=1.85)
+@pytest.mark.parametrize(
+    ("poses", "said"),
+    [
+        (80, r"block holds 30 meshes of 0.4 kB, but 4 tiles .* have 65. Set it to .* or"),
+        (8, "all 64 meshes .* leave it"),
+    ],
+)
+def test_a_block_that_is_too_small_for_the_shards_is_refused(poses: int, said: str) -> None:
+    with pytest.raises(RecipeError, match=said):
+        blocks(identities=8, poses=poses, height=2, width=2, held=1.85)
+
+
+@pytest.mark.parametrize("last", [1, 3, 5, 10])
+def test_what_lies_in_a_short_last_shard_is_drawn_no_more_often(last: int) -> None:
+    columns = Strips(np.arange(50 + last) // 10)
+    block = Block(Strips(np.arange(24) // 2), columns, meshes=500, mesh_bytes=1)
+    order = BlockOrder(range(24), range(50 + last), block, batch=6, seed=0)
+    drawn = np.bincount(np.concatenate([order.epoch(number)[:, 3] for number in range(30)]), minlength=50 + last)
+    share = drawn[50:].mean() / drawn[:50].mean()
+    assert 0.4 < share < 1.15 and drawn.min() > 0
 
 
 def test_ranks_that_cannot_share_equally_share_all_of_a_batch() -> None:
