@@ -2,9 +2,9 @@
 
     python -m benchmarks.scale [scale.png]      # the tables and the picture of docs/scale.md
 
-One driver hands out shards (`datagen.generate.ray_runner`: three a CPU in flight); a CPU makes one, and holds it until
-it is stored, through the network of its node and the object store that all share. Whoever is busy all the time is the
-bottleneck.
+One driver hands out tasks (`datagen.generate.ray_runner`: three a CPU in flight), each of a shard or, where shards are
+small, of as many as take half a second; a CPU makes them, and holds them until they are stored, through the network of
+its node and the object store that all share. Whoever is busy all the time is the bottleneck.
 """
 
 import heapq
@@ -16,19 +16,20 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from datagen.generate.shards import TASK_SECONDS
 from training.viz.style import DPI, INK, PAGE, QUIET, logarithmic, method_colors, saved, style_axes
 
 MESHES = 1_000_000_000
 NODES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_ROUNDS = 4  # shards a CPU that are simulated
+_ROUNDS = 4  # tasks a CPU that are simulated
 _IN_FLIGHT = 3
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one shard takes, in seconds of each of those that it passes.
+    """What one task takes, in seconds of each of those that it passes.
 
-    ``driver`` and ``finish`` (the manifest's part, after the last shard) are of one process; ``make`` of a CPU of a
+    ``driver`` and ``finish`` (the manifest's part, after the last task) are of one process; ``make`` of a CPU of a
     node; ``send`` of a node's network; ``store`` of the object store that all nodes share.
     """
 
@@ -47,7 +48,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Seconds that some shards took, and the share of it that each was busy."""
+    """Seconds that some tasks took, and the share of it that each was busy."""
 
     seconds: float
     busy: dict[str, float]
@@ -57,12 +58,12 @@ class Outcome:
         return max(self.busy, key=lambda name: self.busy[name])
 
 
-def simulate(work: Work, shards: int, *, nodes: int, cpus: int = 16) -> Outcome:
-    """Make shards: first come, first served by the driver, then a CPU, its node's network, the store."""
+def simulate(work: Work, tasks: int, *, nodes: int, cpus: int = 16) -> Outcome:
+    """Do tasks: first come, first served by the driver, then a CPU, its node's network, the store."""
     events: list[tuple[float, int, str, int]] = []
     idle, network = [node for _ in range(cpus) for node in range(nodes)], [0.0] * nodes
     driver = store = now = 0.0
-    to_do, in_flight, waiting, number = shards, 0, 0, count()
+    to_do, in_flight, waiting, number = tasks, 0, 0, count()
 
     def at(moment: float, what: str, node: int) -> None:
         heapq.heappush(events, (moment, next(number), what, node))
@@ -89,17 +90,17 @@ def simulate(work: Work, shards: int, *, nodes: int, cpus: int = 16) -> Outcome:
                 waiting -= 1
                 at(now + work.make, "made", idle.pop())
     totals = {
-        "driver": shards * work.driver,
-        "CPUs": shards * work.make / (nodes * cpus),
-        "network": shards * work.send / nodes,
-        "object store": shards * work.store,
+        "driver": tasks * work.driver,
+        "CPUs": tasks * work.make / (nodes * cpus),
+        "network": tasks * work.send / nodes,
+        "object store": tasks * work.store,
     }
-    return Outcome(now + shards * work.finish, {name: total / now for name, total in totals.items()})
+    return Outcome(now + tasks * work.finish, {name: total / now for name, total in totals.items()})
 
 
-# Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md), FINISH (benchmarks.driver).
-# Assumed: DRIVER; benchmarks.driver measures it.
-DRIVER, FINISH = 1.0e-3, 0.165e-3
+# Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md); by benchmarks.driver, DRIVER
+# for a task and FINISH for a shard.
+DRIVER, FINISH = 0.836e-3, 0.085e-3
 # Assumed: a node of 16 CPUs with 12.5 Gbit/s; 3,500 objects written a second below one prefix, whatever their size.
 CPUS, NETWORK, PUTS = 16, 12.5e9 / 8, 3500
 # Assumed prices in dollars: an hour of a node, a terabyte kept for a month, a million objects written.
@@ -116,8 +117,10 @@ class Body:
 
     @property
     def work(self) -> Work:
-        send = self.shard * self.size / NETWORK
-        return Work(self.shard, DRIVER, self.shard / self.rate, send, 1 / PUTS, finish=FINISH)
+        shards = max(1, int(TASK_SECONDS * self.rate / self.shard))
+        meshes = shards * self.shard
+        send = meshes * self.size / NETWORK
+        return Work(meshes, DRIVER, meshes / self.rate, send, shards / PUTS, finish=shards * FINISH)
 
     @property
     def bill(self) -> str:
@@ -140,9 +143,9 @@ BODIES = {
 
 def hours(work: Work, nodes: int) -> tuple[float, str]:
     """Hours of a billion meshes at the pace of the steady state, which the later of two halves has; the bottleneck."""
-    shards = _ROUNDS * nodes * CPUS
-    half, whole = (simulate(work, count, nodes=nodes, cpus=CPUS) for count in (shards // 2, shards))
-    return MESHES / work.meshes * (whole.seconds - half.seconds) / (shards / 2) / 3600, whole.bottleneck
+    tasks = _ROUNDS * nodes * CPUS
+    half, whole = (simulate(work, count, nodes=nodes, cpus=CPUS) for count in (tasks // 2, tasks))
+    return MESHES / work.meshes * (whole.seconds - half.seconds) / (tasks / 2) / 3600, whole.bottleneck
 
 
 def draw(results: dict[str, Sequence[tuple[float, str]]], path: Path) -> None:

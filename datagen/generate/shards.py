@@ -22,7 +22,7 @@ from datagen.store.writer import ShardWriter, existing_shard
 
 Wanted = tuple[Shard, str | None]
 """A shard, and its sha256 where the dataset has a manifest already: other bytes are neither kept nor written."""
-_TASK_SECONDS, _FEWEST_TASKS = 0.5, 64
+TASK_SECONDS, _FEWEST_TASKS = 0.5, 64
 """Of work in a task at most, and tasks at least: for many workers, and for progress that is seen."""
 
 
@@ -84,7 +84,7 @@ def sound_bounds(recipe: DatasetRecipe, shard: Shard, meshes: NDArray[np.float32
 def batches(recipe: DatasetRecipe, shards: Sequence[Wanted]) -> Iterator[list[Wanted]]:
     """Divide shards among tasks: each makes at least one, half a second of them where there are many."""
     estimates = [seconds_of(recipe, shard.rows, shard.vertices) for shard, _ in shards]
-    most, batch, seconds = min(_TASK_SECONDS, sum(estimates) / _FEWEST_TASKS), list[Wanted](), 0.0
+    most, batch, seconds = min(TASK_SECONDS, sum(estimates) / _FEWEST_TASKS), list[Wanted](), 0.0
     for wanted, estimate in zip(shards, estimates, strict=True):
         if batch and seconds + estimate > most:
             yield batch
