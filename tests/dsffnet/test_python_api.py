@@ -116,6 +116,7 @@ def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch,
     assert said[-1].endswith("choose another path")
     advice = "add --align, or --up=Z,Y --front=-Y,Z: or add --force; look at --picture"
     assert _of_python(advice) == "add align=True, or up='Z,Y', front='-Y,Z': or add force=True; look at it"
+    assert _of_python("State --up=Z") == "State up='Z'"
 
 
 def test_a_scene_is_posed_as_one_body(run: Path) -> None:
