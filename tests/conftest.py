@@ -1,5 +1,6 @@
 """Shared fixtures: a tiny dataset of the procedural leg, made once a session and copied where a test spoils it."""
 
+import os
 import shutil
 import signal
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ import pytest
 
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
+
+_MLFLOW = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -20,6 +23,29 @@ def _signals_are_heeded() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_mlflow_of_the_developer() -> Iterator[None]:
+    """Nothing of the suite may find, or write into, the MLflow server of whoever runs it."""
+    with pytest.MonkeyPatch.context() as patched:
+        for name in _MLFLOW:
+            patched.delenv(name, raising=False)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _mlflow_as_it_was() -> Iterator[None]:
+    """``mlflow.set_tracking_uri`` writes into the process's environment; the next test must not see it."""
+    before = {name: os.environ.get(name) for name in _MLFLOW}
+    yield
+    if before != {name: os.environ.get(name) for name in _MLFLOW}:
+        import mlflow
+
+        mlflow.set_tracking_uri(before["MLFLOW_TRACKING_URI"])
+        mlflow.set_registry_uri(before["MLFLOW_REGISTRY_URI"])
+        os.environ.pop("MLFLOW_REGISTRY_URI", None)  # which it leaves
+        os.environ.update({name: uri for name, uri in before.items() if uri is not None})
 
 
 @pytest.fixture(scope="session")
