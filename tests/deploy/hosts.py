@@ -6,13 +6,14 @@ slowed, power cut. Nothing changes outside the namespaces, and all of it ends wi
 
 import re
 import secrets
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import composefile
@@ -38,8 +39,9 @@ ip link set switch up
 ip address add {_NETWORK}.1/24 dev switch
 """
 _PROBE = f"{_SWITCH} ip link add one type veth peer name two"
-_IN_ROOT = f'cd {ROOT} && exec "$0" "$@"'
-_COMES_BACK = f'cd {ROOT} && while :; do "$0" "$@"; sleep 1; done'  # as Compose's `restart: unless-stopped`
+_TO_ROOT = f"cd {shlex.quote(str(ROOT))}"
+_IN_ROOT = f'{_TO_ROOT} && exec "$0" "$@"'
+_COMES_BACK = f'{_TO_ROOT} && while :; do "$0" "$@"; sleep 1; done'  # as Compose's `restart: unless-stopped`
 
 
 def why_not() -> str:
@@ -181,10 +183,11 @@ class Lab:
         return self.hosts[name]
 
     def end(self) -> None:
-        for host in self.hosts.values():
-            host.end()
-        self._switch.end()
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """End all of it, and remove the folder, also where one of them resists."""
+        with ExitStack() as ends:
+            ends.callback(shutil.rmtree, self.folder, ignore_errors=True)
+            for each in (self._switch, *self.hosts.values()):
+                ends.callback(each.end)
 
     def environment(self, service: str = "client") -> dict[str, str]:
         """The service's environment in the Compose file, and where its secrets would be."""
