@@ -66,22 +66,22 @@ docs: $(READY) ## the documentation as a site, build/site/index.html; a broken l
 bench: bench-generation bench-networks bench-input bench-training bench-transfer ## every benchmark for a CPU
 
 bench-generation: $(READY) ## making meshes: ratios to NPT's way and to Anny's own forward pass
-	@$(BIN)/python -m benchmarks.generation $(ARGS)
+	@$(BIN)/python -m benchmarks.datagen.generation $(ARGS)
 
 bench-networks: $(READY) ## the networks: fast against literal form, float32 and bfloat16, memory
-	@$(BIN)/python -m benchmarks.networks $(ARGS)
+	@$(BIN)/python -m benchmarks.networks.forms $(ARGS)
 
 bench-input: $(READY) ## the share of a training step that waits for its batch, from every cache
-	@$(BIN)/python -m benchmarks.input_wait $(ARGS)
+	@$(BIN)/python -m benchmarks.training.input_wait $(ARGS)
 
 bench-training: $(READY) ## two ranks of one thread each against one process of two threads
-	@$(BIN)/python -m benchmarks.training $(ARGS)
+	@$(BIN)/python -m benchmarks.training.ranks $(ARGS)
 
 bench-transfer: $(READY) ## one transfer of 6,890 vertices at the paper's widths, and the whole command
-	@$(BIN)/python -m benchmarks.transfer $(ARGS)
+	@$(BIN)/python -m benchmarks.transfer.seconds $(ARGS)
 
 bench-gpu: $(READY) ## DSFFNet on a GPU: fast against literal form, share of the chip's ceiling
-	@$(BIN)/python -m benchmarks.gpu $(ARGS)
+	@$(BIN)/python -m benchmarks.networks.gpu $(ARGS)
 
 ui: export OUT := $(OUT)
 ui: $(READY) ## the MLflow page of the quickstart (another: OUT=folder; another port: UI_PORT=5001)

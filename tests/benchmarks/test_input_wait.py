@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def test_the_benchmark_of_input_waiting_runs() -> None:
-    command = [sys.executable, "-m", "benchmarks.input_wait", "--quick", "--threads", "1", "--device", "cpu"]
+    command = [sys.executable, "-m", "benchmarks.training.input_wait", "--quick", "--threads", "1", "--device", "cpu"]
     done = subprocess.run(
         [*command, "--poses", "20"],
         cwd=Path(__file__).parents[2],

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import gpu
-from benchmarks.running import backward, gradient, random_meshes, relative, step, with_every_branch
+from benchmarks.networks import gpu
+from benchmarks.networks.running import backward, gradient, random_meshes, relative, step, with_every_branch
 from training.networks.dsffnet import DSFFNet
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +22,7 @@ class Absent:
             raise ModuleNotFoundError(f"{name} is not on this machine")
 sys.meta_path.insert(0, Absent())
 del sys.argv[0]
-runpy.run_module("benchmarks.gpu", run_name="__main__", alter_sys=True)
+runpy.run_module("benchmarks.networks.gpu", run_name="__main__", alter_sys=True)
 """
 ABSENT = "anny,google_crc32c,matplotlib,mlflow,numcodecs,pandas,pydantic,ray,safetensors,smplx,trimesh,yaml,zarr"
 TINY = ["--device", "cpu", "--vertices", "60", "--batches", "2", "--narrow"]
@@ -95,7 +95,7 @@ def test_nothing_is_begun_after_the_minutes_that_were_given(
 
 
 def test_the_network_benchmark_says_how_far_forms_are_apart_and_what_the_losses_take() -> None:
-    printed = run("-m", "benchmarks.networks", "--quick", "--threads", "1")
+    printed = run("-m", "benchmarks.networks.forms", "--quick", "--threads", "1")
     exact, rounded = differences(line_of(printed, "forward"))
     assert 0 < exact < 1e-5 < rounded
     exact, rounded = differences(line_of(printed, "step"))
@@ -105,7 +105,7 @@ def test_the_network_benchmark_says_how_far_forms_are_apart_and_what_the_losses_
 
 
 def test_the_memory_of_a_step_is_measured_in_a_process_of_its_own() -> None:
-    mebibytes = float(run("-m", "benchmarks.networks", "--memory", "fast", "--vertices", "60"))
+    mebibytes = float(run("-m", "benchmarks.networks.forms", "--memory", "fast", "--vertices", "60"))
     weights = 9_371_023 * 4 / 2**20
     assert weights / 2 < mebibytes < 40 * weights  # at least the gradients, some of which are there before
 
@@ -123,6 +123,6 @@ def test_a_step_leaves_no_gradients_and_differences_are_seen() -> None:
     assert relative(gradient(network, "float32", meshes), first) > 1e-6
 
 
-@pytest.mark.parametrize("module", sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z]*.py")))
-def test_every_benchmark_finds_what_it_imports(module: str) -> None:
-    importlib.import_module(f"benchmarks.{module}")
+@pytest.mark.parametrize("module", sorted((ROOT / "benchmarks").rglob("[a-z]*.py")), ids=lambda path: path.stem)
+def test_every_benchmark_finds_what_it_imports(module: Path) -> None:
+    importlib.import_module(".".join(module.relative_to(ROOT).with_suffix("").parts))

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from benchmarks.scale import BODIES, Work, simulate
+from benchmarks.datagen.scale import BODIES, Work, simulate
 
 WORK = Work(meshes=100, driver=0.001, make=0.5, send=0.05, store=0.002, finish=0.0001)
 

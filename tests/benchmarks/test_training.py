@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.training import QUICKSTART, rate, recipe_of
+from benchmarks.training.ranks import QUICKSTART, rate, recipe_of
 
 
 def test_a_rank_that_fails_is_told_with_its_reason(tmp_path: Path) -> None:
@@ -17,7 +17,7 @@ def test_a_rank_that_fails_is_told_with_its_reason(tmp_path: Path) -> None:
 
 @pytest.mark.slow  # five processes that import torch
 def test_the_benchmark_of_ranks_against_threads_runs() -> None:
-    command = [sys.executable, "-m", "benchmarks.training", "--quick"]
+    command = [sys.executable, "-m", "benchmarks.training.ranks", "--quick"]
     done = subprocess.run(
         command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=300, check=False
     )

@@ -1,4 +1,4 @@
-"""What is said of how a mesh stands: ``python -m benchmarks.standing workflows/pretrained/anny-quickstart``.
+"""What is said of how a mesh stands: ``python -m benchmarks.transfer.standing workflows/pretrained/anny-quickstart``.
 
 Anny bodies that the weights have not seen, of the vertex layout that they were trained on and of others, and the twelve
 CC0 animals, each turned about the vertical by 0 to 80 degrees; 90 degrees only permute the 24 ways, as does every other

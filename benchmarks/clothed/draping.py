@@ -1,10 +1,10 @@
 """Dressed people: pictures of every outfit, and how good draped garments are.
 
-python -m benchmarks.clothed picture docs/images/bodies-clothed.png
-python -m benchmarks.clothed sheet docs/images/clothed-people.png --identities 6 --poses 1 --subdivide 0
-python -m benchmarks.clothed people FOLDER --identities 50 --poses 20 --subdivide 0   # again: resumes
-python -m benchmarks.clothed walk docs/images/clothed-walk.gif
-python -m benchmarks.clothed measure [--outfits coat] [--identities 3] [--poses 4] [--subdivide 0]
+python -m benchmarks.clothed.draping picture docs/images/bodies-clothed.png
+python -m benchmarks.clothed.draping sheet docs/images/clothed-people.png --identities 6 --poses 1 --subdivide 0
+python -m benchmarks.clothed.draping people FOLDER --identities 50 --poses 20 --subdivide 0   # again: resumes
+python -m benchmarks.clothed.draping walk docs/images/clothed-walk.gif
+python -m benchmarks.clothed.draping measure [--outfits coat] [--identities 3] [--poses 4] [--subdivide 0]
 """
 
 import argparse

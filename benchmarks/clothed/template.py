@@ -1,9 +1,9 @@
 """Stage 1 of FITE on one person in a skirt: the field, canonical points, the template. Times are CPU seconds.
 
-python -m benchmarks.avatar field
-python -m benchmarks.avatar roots
-python -m benchmarks.avatar template FOLDER [--steps 1250]
-python -m benchmarks.avatar skin docs/images/skin.png
+python -m benchmarks.clothed.template field
+python -m benchmarks.clothed.template roots
+python -m benchmarks.clothed.template template FOLDER [--steps 1250]
+python -m benchmarks.clothed.template skin docs/images/skin.png
 """
 
 import argparse

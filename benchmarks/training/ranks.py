@@ -1,4 +1,4 @@
-"""Two ranks of one thread against one process of two: ``python -m benchmarks.training [--rounds 3] [--quick]``.
+"""Two ranks of one thread against one process of two: ``python -m benchmarks.training.ranks [--rounds 3] [--quick]``.
 
 DSFFNet at the quickstart's widths, a batch of 8 over both ranks, on legs of 615 and 1,230 vertices (the quickstart's
 bodies, and the next topology of Anny). Both ways are whole trainings by ``python -m training.engine``, in turns, on the
@@ -19,12 +19,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.input_wait import BATCH, CASES, Case, legs
+from benchmarks.training.input_wait import BATCH, CASES, Case, legs
 from training.recipes.training import TrainingRecipe
 
 GOAL = 0.9
 TIMEOUT = 1800.0
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 QUICKSTART = CASES["quickstart, 615 vertices"]
 SIZES = {"615 vertices": QUICKSTART, "1,230 vertices": QUICKSTART._replace(segments=2 * QUICKSTART.segments)}
 WAYS = {"2 ranks x 1 thread": (2, 1), "1 process x 2 threads": (1, 2)}

@@ -1,4 +1,4 @@
-"""Share of a training step that waits for input: ``python -m benchmarks.input_wait [--threads 2] [--quick]``.
+"""Share of a training step that waits for input: ``python -m benchmarks.training.input_wait [--threads 2] [--quick]``.
 
 DSFFNet at the quickstart's widths and at the paper's, batch 8, on a grid of procedural legs with as many vertices as
 the quickstart's bodies (615) and SMPL (6,890). A streamed bank may hold a quarter of the meshes. A step is input,

@@ -1,4 +1,4 @@
-"""How far bfloat16 moves a trained network's outputs: ``python -m benchmarks.rounding RUN DATA.zarr [--triples 64]``.
+"""How far bfloat16 moves a network's outputs: ``python -m benchmarks.networks.rounding RUN DATA.zarr [--triples 64]``.
 
 PMD between the outputs in bfloat16 and in float32, for unseen poses of new identities of a dataset (in the box of each
 mesh, see :func:`training.objectives.metrics.point_mesh_distance`), beside their PMD from the truth. The aim is a mean

@@ -1,6 +1,6 @@
 """What one driver spends on a task and on a shard: CPU seconds, as it is the one process that no node can share.
 
-    python -m benchmarks.driver
+    python -m benchmarks.datagen.driver
 
 Tasks that have nothing to do on a Ray of this machine, handed out as generation hands out its shards; then a dataset of
 1,000 shards of one leg each, made in this process, from the last shard on: sizes compared, manifest written, opened.
@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.dataset_shape import recipe_of
+from benchmarks.datagen.dataset_shape import recipe_of
 from datagen.generate import generate, ray_runner
 from datagen.generate.plan import plan_of
 from datagen.recipe import DatasetRecipe

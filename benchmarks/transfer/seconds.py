@@ -1,4 +1,4 @@
-"""How long a transfer takes: ``python -m benchmarks.transfer [--run RUN] [--threads 2] [--vertices 6890]``.
+"""How long a transfer takes: ``python -m benchmarks.transfer.seconds [--run RUN] [--threads 2] [--vertices 6890]``.
 
 One pair with the model loaded is a DSFFNet of the paper's widths (random weights: the time is the same) and two spheres
 of so many vertices; the median of ten, after one for warming up. The whole command is a process of its own, from its

@@ -1,6 +1,6 @@
 """Three ways to bring a dressed person into a source's pose, where the truth is simulated: DSFFNet, `parts`, an avatar.
 
-python -m benchmarks.avatar_transfer runs/avatar [--frames 8] [--picture transfer.png]
+python -m benchmarks.clothed.avatar_transfer runs/avatar [--frames 8] [--picture transfer.png]
 
 The source is a bare person of Anny in the avatar's unseen poses. The networks move a scan of the dressed person in the
 seen pose that turns joints least; the avatar is driven by the pose that the weights `human` read off the source, and by

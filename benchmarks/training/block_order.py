@@ -1,6 +1,6 @@
 """What an order of triples in blocks of shards costs in PMD, against full shuffling at equal steps.
 
-python -m benchmarks.block_order FOLDER [--seeds 3] [--blocks 930kB 470kB]
+python -m benchmarks.training.block_order FOLDER [--seeds 3] [--blocks 930kB 470kB]
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Generation at breadth: many identities in few poses against few identities in many poses, by the command itself.
 
-    python -m benchmarks.breadth [identities ...] [--ray] [--folder FOLDER]
+    python -m benchmarks.datagen.breadth [identities ...] [--ray] [--folder FOLDER]
 
 For each number of identities (2,000 by default) legs are made in 10 poses, then 100 identities in as many poses as give
 the same number of meshes. Every step is a process of its own (``dsffnet generate``, ``verify``, ``inspect``,

@@ -1,7 +1,7 @@
 """Networks on people in clothes, whose truth is draped: a table by what the target wears, and a picture.
 
-python -m benchmarks.clothed_transfer table DATA FOLDER NAME=WEIGHTS [NAME=WEIGHTS ...] [--triples 100]
-python -m benchmarks.clothed_transfer picture DATA FOLDER NAME=WEIGHTS [...] --picture docs/images/clothed-transfer.png
+python -m benchmarks.clothed.transfer table DATA FOLDER NAME=WEIGHTS [NAME=WEIGHTS ...] [--triples 100]
+python -m benchmarks.clothed.transfer picture DATA FOLDER NAME=WEIGHTS [...] --picture docs/images/clothed-transfer.png
 
 DATA is of the body `mixed`: Anny, then `clothed` (recipe `clothed-transfer-test`). FOLDER keeps what is measured; the
 same command again goes on. The picture shows of each outfit the triple of the median PMD of the last network.

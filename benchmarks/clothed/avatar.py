@@ -1,6 +1,6 @@
 """The point avatar on simulated scans of one person in a skirt: what each part of the method is worth.
 
-python -m benchmarks.avatar_points /tmp/avatar [--steps 600] [--normalisation group] [--picture avatar.png]
+python -m benchmarks.clothed.avatar /tmp/avatar [--steps 600] [--normalisation group] [--picture avatar.png]
 
 The template is a stand-in for a learned one: the dressed mesh, skinned to the canonical pose and simplified, with the
 weights of the nearest vertex of the bare body. Scans are kept in the folder, and made once.

@@ -1,4 +1,4 @@
-"""CPU time from a click on the page of ``dsffnet demo`` to its result: ``python -m benchmarks.demo``.
+"""CPU time from a click on the page of ``dsffnet demo`` to its result: ``python -m benchmarks.transfer.demo``.
 
 Counted is what the server does: bodies made, written and read, the pose given, the truth measured; neither the way to
 the browser nor its drawing. Every time the source has another pose. CPU seconds are the process' own (user and system),

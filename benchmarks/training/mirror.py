@@ -1,6 +1,6 @@
 """What the MLflow mirror costs a training in the same process: steps a second with it and without, in turns.
 
-    python -m benchmarks.mirror [--rounds 4] [--seconds 10] [--uri http://127.0.0.1:5000]
+    python -m benchmarks.training.mirror [--rounds 4] [--seconds 10] [--uri http://127.0.0.1:5000]
 
 Beside the ratio, which a busy machine makes noise of, it prints the processor time of the mirror's thread: it holds the
 interpreter's lock for no longer than that, so its share of the time bounds what the training can lose.

@@ -1,4 +1,4 @@
-"""The networks, fast form against literal form, on a CPU: ``python -m benchmarks.networks [--threads 2] [--quick]``.
+"""The networks, fast against literal form, on a CPU: ``python -m benchmarks.networks.forms [--threads 2] [--quick]``.
 
 Every form has the same weights and inputs and all run in turns, so that a slow moment of the machine hits all; times
 are medians. Forward passes are timed before any backward pass, which leaves warm memory behind that a process which
@@ -23,8 +23,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from benchmarks.networks.running import (
+    Meshes,
+    forward,
+    gradient,
+    largest,
+    random_meshes,
+    relative,
+    step,
+    with_every_branch,
+)
 from benchmarks.peak_memory import forget_peak, peak_mebibytes
-from benchmarks.running import Meshes, forward, gradient, largest, random_meshes, relative, step, with_every_branch
 from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.execution import Precision
@@ -169,7 +178,7 @@ def peak_of_a_step(form: str, vertices: int) -> float:
 
 def memory() -> None:
     """Peak memory of a training step of each form, each in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.networks", "--memory"]
+    command = [sys.executable, "-m", "benchmarks.networks.forms", "--memory"]
     peaks = {
         form: float(subprocess.run([*command, form], capture_output=True, text=True, check=True).stdout)
         for form in FORMS

@@ -1,4 +1,4 @@
-"""What refinement is worth: ``python -m benchmarks.transfer_quality RUN DATA [--triples 100]``.
+"""What refinement is worth: ``python -m benchmarks.transfer.refinement RUN DATA [--triples 100]``.
 
 By weight, over the dataset's unseen evaluation triples, whose truth is known.
 """

@@ -1,4 +1,4 @@
-"""DSFFNet on one device, fast form against literal form: ``python -m benchmarks.gpu``.
+"""DSFFNet on one device, fast form against literal form: ``python -m benchmarks.networks.gpu``.
 
 First whether the device computes what a CPU does and what rounding costs; then one pair at a time, called and by CUDA
 graph; then forward and training step of whole batches, in float32, TF32 and bfloat16: literal, fast, and fast through
@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from benchmarks.running import (
+from benchmarks.networks.running import (
     Meshes,
     forward,
     gradient,

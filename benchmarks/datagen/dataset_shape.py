@@ -1,6 +1,6 @@
 """A dataset of many identities against one of many poses: making, opening, objects on disk, reading.
 
-    python -m benchmarks.dataset_shape [rounds]
+    python -m benchmarks.datagen.dataset_shape [rounds]
 
 The same number of meshes of the procedural leg, as 2,000 identities in 10 poses and as 20 identities in 1,000, made in
 this process (as with ``--local``) in interleaved rounds. Reading is from the page cache: single meshes at random, one

@@ -1,6 +1,6 @@
 """Making meshes: this project end to end, against the body model alone, and against the way of NPT's generator.
 
-    python -m benchmarks.generation [topology ...]
+    python -m benchmarks.datagen.generation [topology ...]
 
 For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
 skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
@@ -137,7 +137,7 @@ def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) 
 
 _WORKER = """
 import sys, tempfile
-from benchmarks.generation import recipe_of
+from benchmarks.datagen.generation import recipe_of
 from benchmarks.peak_memory import peak_mebibytes
 from datagen.generate import ensure_shards
 from datagen.generate.plan import prepare
@@ -151,7 +151,7 @@ print(peak_mebibytes())
 
 def memory(topology: str) -> None:
     """Peak resident memory of a worker after a small and after a larger grid."""
-    root = str(Path(__file__).parents[1])
+    root = str(Path(__file__).parents[2])
     peaks = []
     for identities in (2, 12):
         command = [sys.executable, "-c", _WORKER, topology, str(identities)]
