@@ -65,7 +65,7 @@ def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("vertices", [1, 127, 128, 300])
+@pytest.mark.parametrize("vertices", [1, 2, 127, 128, 129, 300])
 def test_bounds_are_those_of_each_mesh_and_show_what_is_not_finite(vertices: int) -> None:
     meshes = np.random.default_rng(0).normal(size=(4, vertices, 3)).astype(np.float32)
     low, high = bounds(meshes)
