@@ -1,11 +1,12 @@
 """Generation at breadth: many identities in few poses against few identities in many poses, by the command itself.
 
-    python -m benchmarks.datagen.breadth [identities ...] [--ray] [--folder FOLDER]
+    python -m benchmarks.datagen.breadth [identities ...] [--anny] [--ray] [--folder FOLDER]
 
-For each number of identities (2,000 by default) legs are made in 10 poses, then 100 identities in as many poses as give
-the same number of meshes. Every step is a process of its own (``dsffnet generate``, ``verify``, ``inspect``,
-``append``), of which is measured: CPU seconds of it and of all that it starts, its own peak memory, and the time to the
-first line of progress. A dataset that is half made when its process is killed shows what resuming takes.
+For each number of identities (2,000 by default) legs, or Anny's bodies of 369 vertices, are made in 10 poses, then
+100 identities in as many poses as give the same number of meshes. Every step is a process of its own (``dsffnet
+generate``, ``verify``, ``inspect``, ``append``), of which is measured: CPU seconds of it and of all that it starts,
+its own peak memory, and the time to the first line of progress. A dataset that is half made when its process is
+killed shows what resuming takes.
 """
 
 import argparse
@@ -96,11 +97,27 @@ def _look(process: psutil.Process, step: Step, spent: dict[int, float]) -> None:
                 spent[each.pid] = times.user + times.system
 
 
-def recipe_of(identities: int, poses: int) -> list[str]:
-    """Options for legs in a grid of training identities and seen poses."""
-    sizes = {"identities.training": identities, "identities.evaluation": 0, "poses.seen": poses, "poses.unseen": 0,
-             "body.rings": 24, "body.segments": 12, "store.poses_per_shard": 100}  # fmt: skip
-    return ["--recipe", "smoke", "--set", *(f"data.{key}={value}" for key, value in sizes.items())]
+BODIES: dict[str, tuple[str, dict[str, int | str]]] = {
+    "leg": ("smoke", {"body.rings": 24, "body.segments": 12}),
+    "anny": ("quickstart", {"body.topology": "notoes_collapse3pc"}),
+}
+"""A recipe by the family of its bodies, and what is set of them."""
+
+
+@dataclass(frozen=True)
+class Making:
+    """How datasets are made."""
+
+    body: str
+    where: tuple[str, ...]
+
+    def command(self, url: Path, identities: int, poses: int) -> list[str]:
+        """``dsffnet generate`` of bodies in a grid of training identities and seen poses."""
+        recipe, of_body = BODIES[self.body]
+        sizes = {"identities.training": identities, "identities.evaluation": 0, "poses.seen": poses, "poses.unseen": 0,
+                 "store.poses_per_shard": 100, **of_body}  # fmt: skip
+        settings = (f"data.{key}={value}" for key, value in sizes.items())
+        return ["generate", "--recipe", recipe, "--out", str(url), *self.where, "--set", *settings]
 
 
 def shards_in(url: Path) -> int:
@@ -118,18 +135,18 @@ def opening(url: Path) -> float:
     return statistics.median(taken)
 
 
-def generate(url: Path, identities: int, poses: int, where: Sequence[str]) -> Step:
+def generate(url: Path, identities: int, poses: int, making: Making) -> Step:
     """Make a dataset and report it."""
-    step = dsffnet("generate", *recipe_of(identities, poses), "--out", str(url), *where)
+    step = dsffnet(*making.command(url, identities, poses))
     objects = sum(path.is_file() for path in url.rglob("*"))
     print(f"generate {identities:7,} x {poses:6,}: {step}; {identities * poses / step.cpu:,.0f} meshes a CPU second; "
           f"opened in {opening(url):.0f} ms; {objects:,} objects, {shards_in(url):,} shards", flush=True)  # fmt: skip
     return step
 
 
-def resume(url: Path, identities: int, where: Sequence[str], shards: int) -> None:
+def resume(url: Path, identities: int, making: Making, shards: int) -> None:
     """Kill a generation half way and report how long the same command takes until it makes the first shard."""
-    made = ["generate", *recipe_of(identities, POSES), "--out", str(url), *where]
+    made = making.command(url, identities, POSES)
     killed = dsffnet(*made, until=lambda: shards_in(url) >= shards // 2)
     half = shards_in(url)
     step = dsffnet(*made, until=lambda: shards_in(url) > half)
@@ -137,33 +154,35 @@ def resume(url: Path, identities: int, where: Sequence[str], shards: int) -> Non
           flush=True)  # fmt: skip
 
 
-def measure(identities: int, folder: Path, where: Sequence[str]) -> None:
+def measure(identities: int, folder: Path, making: Making) -> None:
     """Measure and print everything of one number of identities."""
     broad, deep, small, half = (folder / f"{name}.zarr" for name in ("broad", "deep", "small", "half"))
-    step = generate(broad, identities, POSES, where)
+    step = generate(broad, identities, POSES, making)
     shards = shards_in(broad)
-    other = generate(deep, FEW, identities * POSES // FEW, where)
+    other = generate(deep, FEW, identities * POSES // FEW, making)
     print(f"  many identities: {other.cpu / step.cpu:.2f} of the meshes a CPU second of few", flush=True)
     shutil.rmtree(deep)
     for command in ("verify", "inspect"):
         print(f"{command:24}: {dsffnet(command, str(broad))}", flush=True)
-    alone = generate(small, APPENDED, POSES, where)
-    grown = dsffnet("append", str(broad), "--training-identities", str(identities + APPENDED), *where)
+    alone = generate(small, APPENDED, POSES, making)
+    grown = dsffnet("append", str(broad), "--training-identities", str(identities + APPENDED), *making.where)
     print(f"append {APPENDED:,} to {identities:,}: {grown}; {grown.cpu / alone.cpu:.2f} of these alone", flush=True)
     shutil.rmtree(broad)
-    resume(half, identities, where, shards)
+    resume(half, identities, making, shards)
 
 
 def main() -> None:
     """Measure each number of identities."""
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("identities", type=int, nargs="*", default=[2000])
+    made.add_argument("--anny", action="store_true", help="bodies of 369 vertices in the place of legs")
     made.add_argument("--ray", action="store_true", help="on Ray where meshes are many, and not in one process")
     made.add_argument("--folder", type=Path, help="where datasets go meanwhile (default: the system's)")
     options = made.parse_args()
+    making = Making("anny" if options.anny else "leg", () if options.ray else ("--local",))
     for identities in options.identities:
         with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-            measure(identities, Path(folder), [] if options.ray else ["--local"])
+            measure(identities, Path(folder), making)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
 
 For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
 skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
-forward, this project's body alone, and whole shards (identity, pose, check, compress, checksum, hash, write). Then
-reading, size, a worker's memory, and one against two Ray workers.
+forward, this project's body alone, and tasks of whole shards (identity, pose, check, compress, checksum, hash, write).
+Then reading, size, a worker's memory, and one against two Ray workers.
 """
 
 import os
@@ -30,10 +30,10 @@ from datagen.mesh.rig import part_transforms
 from datagen.poses import draw_poses
 from datagen.recipe import DatasetRecipe
 
-POSES, IDENTITIES, ROUNDS, ONE_AT_A_TIME = 100, 7, 7, 10
+POSES, SHARDS, ROUNDS, ONE_AT_A_TIME = 100, 4, 7, 10
 
 
-def recipe_of(topology: str, identities: int = IDENTITIES, poses: int = POSES) -> DatasetRecipe:
+def recipe_of(topology: str, identities: int = SHARDS * ROUNDS, poses: int = POSES) -> DatasetRecipe:
     """A grid of Anny bodies, one shard of 100 poses after another."""
     sizes = {"identities": {"training": identities, "evaluation": 0}, "poses": {"seen": poses, "unseen": 0}}
     return DatasetRecipe.model_validate({"body": {"family": "anny", "topology": topology}, **sizes})
@@ -102,7 +102,7 @@ def measure(topology: str, folder: Path) -> None:
         ),
         "anny": (forward, POSES),
         "body": (lambda: body.vertices(parameters, poses), POSES),
-        "shard": (lambda: ensure_shards(url, recipe, [(todo.pop(), None)]), POSES),
+        "shard": (lambda: ensure_shards(url, recipe, [(todo.pop(), None) for _ in range(SHARDS)]), SHARDS * POSES),
     }
     forward(), body.vertices(parameters, poses)
     found = {name: [] for name in ways}  # type: dict[str, list[float]]
