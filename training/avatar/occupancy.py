@@ -20,8 +20,7 @@ from training.avatar.roots import TransformField, canonical_roots, starting_bone
 from training.avatar.solid import Solid
 
 _BLUR = 0.025  # metres
-_UNIFORM = 8  # one such point of so many near the surface
-_MARGIN = 0.1  # metres around a scan, for the uniform ones
+_FREE = 8  # one such point for so many near the surface
 HIDDEN_DEPTH = 0.004
 """Metres within another part, from which a point of a surface counts as hidden."""
 _HAND_BLURS = (0.005, 0.03)  # metres; with the first alone hands grow where nothing is said of what is around them
@@ -37,7 +36,7 @@ class FrameSamples(NamedTuple):
     inside
         Whether each is inside [n].
     near
-        Whether each was drawn near the surface [n], rather than anywhere in the box.
+        Whether each was drawn near the surface [n] of the scan, not as a canonical place.
     """
 
     roots: Tensor
@@ -57,7 +56,9 @@ def frame_samples(
 ) -> FrameSamples:
     """Points around a scan with labels and canonical places.
 
-    Places on hands do not count: hands are finer than the field.
+    Places on hands do not count near the surface: hands are finer than the field. Of canonical places in the field's
+    box those count which the pose moves 25 mm or more out of the scan. They need no root to be found, and reach where
+    no posed point near a scan comes from: above the head, beyond the feet.
 
     Parameters
     ----------
@@ -66,20 +67,34 @@ def frame_samples(
     transforms
         Of the pose [bone, 3, 4] (:meth:`CanonicalBody.transforms`).
     count
-        Points near the surface; an eighth as many more are uniform in the scan's box.
+        Points near the surface; an eighth as many more are canonical places, uniform in the field's box.
     """
-    points = _drawn(random, scan, count)
     moved, bones = torch.from_numpy(transforms).float(), starting_bones(body)
     deformation = TransformField.of(field, moved)
+    _, points, _ = _on_surface(random, scan, count)
+    points += random.normal(0, _BLUR, points.shape)
     roots, valid = canonical_roots(deformation, torch.from_numpy(points).float(), moved, bones)
     on_hand = field.weights(roots.reshape(-1, 3))[:, torch.from_numpy(body.hands)].sum(dim=1).reshape(valid.shape)
-    inside, near = torch.from_numpy(inside_any(scan, points)), torch.arange(len(points)) < count
-    return FrameSamples(roots, valid & (on_hand < 0.5), inside, near)
+    low, high = field.low.numpy(), field.high.numpy()
+    places = torch.from_numpy(random.uniform(low, high, (count // _FREE, 3))).float()
+    free = torch.from_numpy(_depth_in_any(scan, deformation.posed(places).numpy()) < -_BLUR)
+    themselves = torch.stack([free, *(2 * [torch.zeros_like(free)])], dim=1)
+    return FrameSamples(
+        torch.cat([roots, places[:, None].expand(-1, roots.shape[1], -1)]),
+        torch.cat([valid & (on_hand < 0.5), themselves]),
+        torch.cat([torch.from_numpy(inside_any(scan, points)), torch.zeros_like(free)]),
+        torch.arange(count + len(free)) < count,
+    )
 
 
 def inside_any(scan: Sequence[Mesh], points: Floats) -> NDArray[np.bool_]:
     """Whether points [n, 3] are inside of any of some meshes [n]."""
-    return np.any([Solid(mesh.vertices, mesh.faces).inside(points) for mesh in scan], axis=0)
+    return _depth_in_any(scan, points) > 0
+
+
+def _depth_in_any(scan: Sequence[Mesh], points: Floats) -> NDArray[np.float32]:
+    depths = [Solid(mesh.vertices, mesh.faces).depth(points) for mesh in scan]
+    return np.max(depths, axis=0)
 
 
 def hand_samples(random: np.random.Generator, body: CanonicalBody, count: int) -> tuple[Tensor, Tensor]:
@@ -110,14 +125,6 @@ def surface_points(
         others = np.flatnonzero(part != number)
         hidden[others] |= Solid(mesh.vertices, mesh.faces).depth(points[others]) > HIDDEN_DEPTH
     return points[~hidden], normals[~hidden]
-
-
-def _drawn(random: np.random.Generator, scan: Sequence[Mesh], count: int) -> NDArray[np.float64]:
-    """Points near the surface, then those anywhere in the box."""
-    _, points, _ = _on_surface(random, scan, count)
-    corners = np.concatenate([mesh.vertices for mesh in scan])
-    anywhere = random.uniform(corners.min(0) - _MARGIN, corners.max(0) + _MARGIN, (count // _UNIFORM, 3))
-    return np.concatenate([points + random.normal(0, _BLUR, points.shape), anywhere])
 
 
 def _on_surface(

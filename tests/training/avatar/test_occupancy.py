@@ -11,6 +11,7 @@ from datagen.mesh.geometry import Mesh
 from tests.support.shapes.canonical import posed_leg
 from training.avatar.diffusion import diffused_skinning
 from training.avatar.occupancy import FrameSamples, frame_samples, hand_samples, inside_any, surface_points
+from training.avatar.roots import TransformField
 from training.avatar.solid import Solid
 
 
@@ -43,10 +44,16 @@ def samples() -> FrameSamples:
     return frame_samples(drawn, scan, body=leg.body, field=field, transforms=leg.transforms[1], count=800)
 
 
-def test_samples_lie_near_the_surface_and_a_ninth_anywhere(samples: FrameSamples) -> None:
+def test_samples_lie_near_the_surface_and_a_ninth_anywhere_in_the_box(samples: FrameSamples) -> None:
     assert samples.roots.shape == (900, 3, 3) and samples.near.sum() == 800
     assert 0.35 < samples.inside[samples.near].float().mean() < 0.65, "as many on either side of the skin"
-    assert samples.inside[~samples.near].float().mean() < 0.2
+    leg, free = posed_leg(), samples.valid[:, 0] & ~samples.near
+    field, places = diffused_skinning(leg.body, centres=200), samples.roots[free, 0]
+    reached = (torch.stack([places.amin(0), places.amax(0)]) - field.low) / (field.high - field.low)
+    assert reached[0].max() < 0.1 and reached[1].min() > 0.9 and free.sum() > 60
+    posed = TransformField.of(field, torch.from_numpy(leg.transforms[1]).float()).posed(places)
+    assert Solid(leg.posed[1], leg.body.faces).depth(posed.numpy()).max() < -0.025
+    assert not samples.inside[~samples.near].any() and not samples.valid[~samples.near, 1:].any()
 
 
 def test_what_is_inside_of_the_scan_is_inside_of_the_canonical_body(samples: FrameSamples) -> None:
