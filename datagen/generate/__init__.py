@@ -1,8 +1,8 @@
 """Generation: a driver that can always be run again around ``make_shard``, a pure function of (recipe, shard).
 
-The driver asks for every shard of the grid that the manifest does not vouch for; while it runs it commits a manifest of
-the shards so far every now and then. A task makes and writes some shards, unless they are there and sound; so a run
-after any interruption does only what is missing, and the bytes come out the same.
+The driver asks for every shard of the grid that is not known to be there; now and then it notes which are. A task makes
+and writes some shards, unless they are there and sound; so a run after any interruption does only what is missing, and
+the bytes come out the same.
 """
 
 import logging
@@ -17,17 +17,17 @@ from datagen.common.errors import BodyError, DatasetError, DsffnetError, RecipeE
 from datagen.generate.plan import assets_of, prepare
 from datagen.generate.runners import Progress, Runner, Task, inline, ray_runner, unseen
 from datagen.generate.shards import Wanted, batches, ensure_shards, make_shard
-from datagen.grid import Grid
+from datagen.grid import Grid, Place
 from datagen.recipe import DatasetRecipe, Growth
 from datagen.recipe.text import faults_text
 from datagen.sizes import require_memory
 from datagen.store.attributes import check_same_assets
 from datagen.store.location import remove, require_ours, writing_alone
-from datagen.store.manifest import ManifestRow
+from datagen.store.manifest import ManifestRow, SoFar
 from datagen.store.reader import Dataset, open_dataset
 from datagen.store.schema import check_extent, open_group, stored_recipe
 from datagen.store.verify import Fault, find_faults
-from datagen.store.writer import committed_hashes, finish, save, vouched_rows
+from datagen.store.writer import finish, known_shards, save
 
 __all__ = [
     "Progress",
@@ -46,7 +46,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 _SAVE_SECONDS, _SAVE_SHARE = 10.0, 50
-"""Between two manifests of the shards so far, at least, and as many times as long as one takes."""
+"""Between two notes of the shards so far, at least, and as many times as long as one takes."""
 
 
 def generate(
@@ -187,36 +187,40 @@ def _make_missing(
     faults: Sequence[Fault] = (),
 ) -> None:
     """Make what is missing of a dataset, which grows from ``before``, or of which ``faults`` were found."""
-    committed = committed_hashes(url)
-    vouched = vouched_rows(url, {fault.path for fault in faults})
+    known = known_shards(url, {fault.path for fault in faults})
     lost = [fault.path for fault in faults if not fault.shard]
-    arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, rows=vouched)
-    there, rows, missing = {row.place: row for row in vouched or ()}, list[ManifestRow](), list[Wanted]()
+    arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, so_far=known)
+    sound, rows, missing = {row.place for row in known.sound}, list[ManifestRow](), list[Wanted]()
+    doubted = {row.place: row for row in (*known.sound, *known.doubted)}
     for shard in arrays.shards():
-        row = there.get(shard.place)
-        if row is not None and row.rows == shard.rows:
-            rows.append(row)
+        row = doubted.get(shard.place)
+        if row is not None and row.place in sound and row.rows == shard.rows:
+            rows.append(doubted.pop(shard.place))
         else:
-            missing.append((shard, committed.get(shard.path)))
+            missing.append((shard, row.sha256 if row else None))
     tasks = [(url, recipe, some) for some in batches(recipe, missing)]
     results = ((sum(row.rows for row in made), made) for made in run(ensure_shards, tasks))
     done = sum(row.rows for row in rows)
-    with _saving(url, recipe, rows) as add:
+    with _saving(url, recipe, rows, doubted) as add:
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
     finish(url, recipe, rows)
 
 
 @contextmanager
-def _saving(url: str, recipe: DatasetRecipe, rows: list[ManifestRow]) -> Iterator[Callable[[list[ManifestRow]], None]]:
+def _saving(
+    url: str, recipe: DatasetRecipe, rows: list[ManifestRow], doubted: dict[Place, ManifestRow]
+) -> Iterator[Callable[[list[ManifestRow]], None]]:
     """Collect rows, and save them now and then and where the block is left early."""
     due = time.monotonic() + _SAVE_SECONDS
 
     def add(made: list[ManifestRow]) -> None:
         nonlocal due
-        rows.extend(made)
+        for row in made:
+            rows.append(row)
+            doubted.pop(row.place, None)
         if (began := time.monotonic()) >= due:
-            save(url, recipe, rows)
+            save(url, recipe, SoFar(rows, [*doubted.values()]))
             now = time.monotonic()
             due = now + max(_SAVE_SECONDS, _SAVE_SHARE * (now - began))
 
@@ -226,7 +230,7 @@ def _saving(url: str, recipe: DatasetRecipe, rows: list[ManifestRow]) -> Iterato
         raise
     except BaseException:
         with suppress(DsffnetError, OSError):  # the first error is the one to report
-            save(url, recipe, rows)
+            save(url, recipe, SoFar(rows, [*doubted.values()]))
         raise
 
 

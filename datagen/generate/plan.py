@@ -19,7 +19,8 @@ from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
 from datagen.recipe import DatasetRecipe
 from datagen.sizes import SECONDS_IDENTITY, SECONDS_POSE
-from datagen.store import Dataset, ManifestRow
+from datagen.store import Dataset
+from datagen.store.manifest import SoFar
 from datagen.store.writer import Plan, begin, begun
 
 READS_FOLDERS = ("imported", "mixed")
@@ -148,7 +149,7 @@ def prepare(
     progress: Progress = unseen,
     before: Dataset | None = None,
     lost: Sequence[str] = (),
-    rows: Sequence[ManifestRow] | None = None,
+    so_far: SoFar | None = None,
 ) -> GridArrays:
     """Create all of a dataset but its shards, unless that is there; return where its meshes go.
 
@@ -158,7 +159,7 @@ def prepare(
     if before is None and not lost and (arrays := begun(url, recipe, head.attributes)) is not None:
         return arrays
     plan = plan_of(recipe, head=head, before=before, run=run, progress=progress)
-    begin(url, plan, growing=before is not None, lost=lost, rows=rows)
+    begin(url, plan, growing=before is not None, lost=lost, so_far=so_far)
     return plan.arrays
 
 

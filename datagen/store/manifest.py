@@ -1,7 +1,7 @@
 """What a complete dataset consists of: a row for each shard, a hash for every other object, one digest over all.
 
 The manifest is committed last, and the root's attributes carry its digest and one of their own, so that nothing in
-a dataset can change unnoticed.
+a dataset can change unnoticed. While a dataset is made, one object beside it says which shards there are so far.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from datagen.grid import SPLITS, GridArrays, Place, Shard, shard_path
 from datagen.mesh.geometry import Bounds
 from datagen.store.arrays import put_array, put_group, read_array, read_json
 from datagen.store.object_names import is_member, require_member
-from datagen.store.objects import list_objects, read_bytes
+from datagen.store.objects import delete_object, list_objects, read_bytes, write_bytes
 from datagen.store.schema import MOST_SHARDS, attributes_of
 
 SEAL = "attributes_sha256"
@@ -35,6 +35,10 @@ _COLUMNS = {
 _MOST = 10**9
 """Of a number in a path."""
 _OBJECTS = "manifest/object_sha256"
+_SO_FAR = "manifest/so_far"
+_SO_FAR_ROW = np.dtype(
+    [("sound", "u1"), *((name, np.dtype(it).newbyteorder("<"), of) for name, (it, of, _) in _COLUMNS.items())]
+)
 
 
 @dataclass(frozen=True, order=True)
@@ -134,6 +138,59 @@ def _hashes(digests: Iterable[str]) -> NDArray[np.uint8]:
     return np.frombuffer(bytes.fromhex("".join(digests)), np.uint8).reshape(-1, 32)
 
 
+@dataclass(frozen=True)
+class SoFar:
+    """The shards of a dataset that is being made.
+
+    Attributes
+    ----------
+    sound
+        Rows of those that are there.
+    doubted
+        Rows of those that have been written before and are to be made again, as the same bytes.
+    """
+
+    sound: Sequence[ManifestRow] = ()
+    doubted: Sequence[ManifestRow] = ()
+
+
+def put_so_far(group: zarr.Group, so_far: SoFar) -> None:
+    """Keep it as one object, whole or not at all, while the manifest stays what was committed."""
+    sound = {row.place for row in so_far.sound}
+    ordered = sorted([*so_far.sound, *so_far.doubted])
+    table = np.zeros(len(ordered), _SO_FAR_ROW)
+    table["sound"] = [row.place in sound for row in ordered]
+    for name, values in manifest_of(ordered, {}).columns.items():
+        table[name] = values
+    content = table.tobytes()
+    write_bytes(group, _SO_FAR, hashlib.sha256(content).digest() + content)
+
+
+def read_so_far(group: zarr.Group) -> SoFar | None:
+    """What :func:`put_so_far` kept; None where there is nothing, or something else."""
+    try:
+        content = read_bytes(group, _SO_FAR)
+    except (OSError, UnsafeFileError):
+        return None
+    if content is None or hashlib.sha256(content[32:]).digest() != content[:32]:
+        return None
+    try:
+        table = np.frombuffer(content[32:], _SO_FAR_ROW)
+        _require_places(table["place"])
+    except ValueError:
+        return None
+    rows = Manifest({name: table[name] for name in _COLUMNS}, {}).shards
+    both: tuple[list[ManifestRow], list[ManifestRow]] = [], []
+    for row, sound in zip(rows, table["sound"], strict=True):
+        both[not sound].append(row)
+    return SoFar(*both)
+
+
+def delete_so_far(group: zarr.Group) -> None:
+    """Remove it, as the manifest has it all."""
+    delete_object(group, _SO_FAR)
+
+
 def commit(
     group: zarr.Group,
     rows: Sequence[ManifestRow],
@@ -194,10 +251,13 @@ def stored_manifest(group: zarr.Group) -> Manifest:
         name: read_array(group, f"manifest/{name}", dtype, (count, *shape))
         for name, (dtype, shape, _) in _COLUMNS.items()
     }
-    place = columns["place"]
-    if ((place < 0) | (place >= [len(SPLITS), *3 * [_MOST]])).any():
-        raise ValueError("place")
+    _require_places(columns["place"])
     return Manifest(columns, {path: sha256.tobytes().hex() for path, sha256 in zip(paths, hashes, strict=True)})
+
+
+def _require_places(places: NDArray[Any]) -> None:
+    if ((places < 0) | (places >= [len(SPLITS), *3 * [_MOST]])).any():
+        raise ValueError("place")
 
 
 def covers(manifest: Manifest, arrays: GridArrays) -> bool:

@@ -22,7 +22,8 @@ _MEMBER = re.compile(
         |(?:weights|joints|corrections)/c/0/0/0)
     |manifest/(?:rows|bytes)/(?:zarr\.json|c/0)
     |manifest/(?:place|sha256|object_sha256)/(?:zarr\.json|c/0/0)
-    |manifest/extent/(?:zarr\.json|c/0/0/0)""",
+    |manifest/extent/(?:zarr\.json|c/0/0/0)
+    |manifest/so_far""",
     re.VERBOSE,
 )
 MEMBERS = ("grid", "topology", "pose", "evaluation", "rig", "manifest")

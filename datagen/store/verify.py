@@ -38,7 +38,7 @@ FaultProgress = Callable[[Iterable[Fault | None], int], Iterable[Fault | None]]
 def find_faults(url: str, *, progress: FaultProgress = lambda shards, total: shards) -> Iterator[Fault]:
     """Check everything: each shard of the dataset's grid, then every other object, by the hashes of the manifest.
 
-    Where a dataset is still being made there is no manifest; its shards are decoded instead.
+    Where a dataset is still being made the manifest does not have all shards; the others are decoded instead.
     """
     group = open_group(url)
     check_version(url, group)

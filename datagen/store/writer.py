@@ -21,7 +21,19 @@ from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, put_array, put_group, put_vertices_metadata, read_json
 from datagen.store.attributes import check_same_assets, check_same_recipe, with_history
-from datagen.store.manifest import SEAL, ManifestRow, changed_objects, commit, is_sealed, read_manifest, row_of
+from datagen.store.manifest import (
+    SEAL,
+    ManifestRow,
+    SoFar,
+    changed_objects,
+    commit,
+    delete_so_far,
+    is_sealed,
+    put_so_far,
+    read_manifest,
+    read_so_far,
+    row_of,
+)
 from datagen.store.object_names import MEMBERS
 from datagen.store.objects import delete_object, list_objects, read_bytes, stored_sizes, write_bytes
 from datagen.store.schema import (
@@ -117,7 +129,7 @@ def begin(
     *,
     growing: bool = False,
     lost: Sequence[str] = (),
-    rows: Sequence[ManifestRow] | None = None,
+    so_far: SoFar | None = None,
 ) -> None:
     """Create the dataset, or whatever an interrupted ``begin`` left out of it.
 
@@ -127,9 +139,9 @@ def begin(
         A complete dataset is there, of the recipe before its last step: from here on it is one in the making.
     lost
         Objects other than shards that were lost or changed, to be made again.
-    rows
-        The shards that are there and sound, which are committed with the objects: a run after an interruption then
-        knows them. None: the manifest stays as it is.
+    so_far
+        The shards that were written before (:func:`known_shards`), which are committed with the objects. It is kept
+        apart first: a manifest that is being written is none.
 
     Raises
     ------
@@ -147,6 +159,9 @@ def begin(
         if not lost:
             check_same_assets(url, group, plan.attributes["body"]["assets"])
         present = attributes_of(group)
+        so_far = so_far or SoFar()
+        if rows := [*so_far.sound, *so_far.doubted]:
+            put_so_far(group, so_far)
         if growing or lost:
             made_by = with_history(plan.provenance, present.get("provenance"))
             group.update_attributes({**wanted, "status": "building", "provenance": made_by})
@@ -156,7 +171,7 @@ def begin(
             if path != "zarr.json":
                 delete_object(group, path)
         _put_arrays(group, plan)
-        if rows is not None and _is_building(as_it_is_now := open_group(url, mode="r+")):
+        if _is_building(as_it_is_now := open_group(url, mode="r+")):
             commit(as_it_is_now, rows, {})
 
 
@@ -206,7 +221,12 @@ class ShardWriter:
             attributes = read_json(self.group, "zarr.json").get("attributes")
         except ArrayDamage:
             attributes = None
-        if not isinstance(attributes, dict) or attributes.get("recipe_sha256") != self._sha256:
+        if not isinstance(attributes, dict):
+            raise DatasetError(
+                f"{self._url} has been removed meanwhile, or its zarr.json cannot be read; this task writes nothing. "
+                "Run the same command again"
+            )
+        if attributes.get("recipe_sha256") != self._sha256:
             raise DatasetError(
                 f"{self._url} is being made by another recipe now; this task leaves it alone. Run one at a time"
             )
@@ -287,31 +307,35 @@ def begun(url: str, recipe: DatasetRecipe, attributes: Mapping[str, Any]) -> Gri
         return None
 
 
-def vouched_rows(url: str, faulty: Collection[str] = ()) -> list[ManifestRow] | None:
-    """The manifest rows of shards that need not be looked at: they are there, of the size that was written.
+def known_shards(url: str, faulty: Collection[str] = ()) -> SoFar:
+    """The shards that were written before: sound are those that are there, of the size that was written.
 
-    None where the manifest is not to be believed: its attributes were changed, or it is among the ``faulty`` objects.
+    None is sound where what is said of them is not to be believed: the root's attributes were changed, or they or the
+    manifest are among the ``faulty`` objects.
     """
     try:
         group = open_group(url)
     except NoDataset:
-        return []
+        return SoFar()
+    manifest = read_manifest(group)
+    so_far = read_so_far(group) if _is_building(group) else None
+    so_far = so_far or SoFar(manifest.shards if manifest else ())
     believed = is_sealed(group) or SEAL not in attributes_of(group)
     if not believed or any(path == "zarr.json" or path.startswith("manifest/") for path in faulty):
-        return None
-    manifest = read_manifest(group)
-    rows = [row for row in manifest.shards if row.path not in faulty] if manifest else []
-    sizes = stored_sizes(group, [row.path for row in rows])
-    return [row for row in rows if sizes.get(row.path) == row.bytes]
+        return SoFar(doubted=[*so_far.sound, *so_far.doubted])
+    sizes = stored_sizes(group, [row.path for row in so_far.sound if row.path not in faulty])
+    both: tuple[list[ManifestRow], list[ManifestRow]] = [], [*so_far.doubted]
+    for row in so_far.sound:
+        both[sizes.get(row.path) != row.bytes].append(row)
+    return SoFar(*both)
 
 
-def save(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
-    """Commit a manifest of the shards so far, so that a run after an interruption knows them without reading them."""
+def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
+    """Keep which shards there are so far, so that a run after an interruption knows them without reading them."""
     with _writing(url):
         group = ShardWriter(url, recipe).group
-        manifest = read_manifest(group)
-        if manifest and is_sealed(group) and _is_building(group):
-            commit(group, rows, {}, objects=manifest.objects)
+        if _is_building(group):
+            put_so_far(group, so_far)
 
 
 def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
@@ -339,16 +363,9 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
                 delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None
         objects = manifest.objects if manifest else None
+        put_so_far(group, SoFar(rows))
         commit(group, rows, {"statistics": statistics, "status": "complete"}, objects=objects)
-
-
-def committed_hashes(url: str) -> dict[str, str]:
-    """The sha256 of each shard that a dataset's manifest has, by path; empty where there is none."""
-    try:
-        manifest = read_manifest(open_group(url))
-    except NoDataset:
-        return {}
-    return {row.path: row.sha256 for row in manifest.shards} if manifest else {}
+        delete_so_far(group)
 
 
 def _writing(url: str) -> contextlib.AbstractContextManager[None]:

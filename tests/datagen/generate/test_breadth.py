@@ -15,6 +15,7 @@ from datagen.generate import append, ensure_shards, generate, identities, inline
 from datagen.generate.identities import describe_identities, joined
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
+from datagen.store.manifest import SoFar
 from datagen.store.verify import find_faults
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import mixed_dataset, tiny_dataset
@@ -117,18 +118,18 @@ def test_what_was_made_before_an_interruption_is_neither_described_nor_read_agai
     assert tree_hash(url) == tree_hash(dataset)
 
 
-def test_a_manifest_of_the_shards_so_far_is_kept_for_a_process_that_is_killed(
+def test_a_note_of_the_shards_so_far_is_kept_for_a_process_that_is_killed(
     dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(generation, "_SAVE_SECONDS", 0.0)
     monkeypatch.setattr(generation, "_SAVE_SHARE", 0)
     saved, real, url = list[int](), generation.save, str(tmp_path / "leg.zarr")
 
-    def dying(url: str, recipe: DatasetRecipe, rows: Any) -> None:
+    def dying(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
         if len(saved) == 3:
             raise SystemExit  # and no more is written
-        saved.append(len(rows))
-        real(url, recipe, rows)
+        saved.append(len(so_far.sound))
+        real(url, recipe, so_far)
 
     monkeypatch.setattr(generation, "save", dying)
     with pytest.raises(SystemExit):

@@ -16,11 +16,11 @@ from datagen.generate.plan import plan_of
 from datagen.generate.shards import require_same_assets
 from datagen.mesh.geometry import bounds
 from datagen.recipe import DatasetRecipe
-from datagen.store import open_dataset
+from datagen.store import manifest, open_dataset
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from datagen.store.writer import ShardWriter
-from tests.support.files import tree_hash
+from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import shards_of, tiny_dataset
 from tests.support.shapes.meshes import npt_folder
 
@@ -163,8 +163,7 @@ def test_other_code_does_not_replace_a_committed_shard(
     shard = shards_of(tiny_dataset())[0]
     (spoilable / shard.path).unlink()
     before = tree_hash(spoilable)
-    real = LegModel.vertices
-    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
+    other_code(monkeypatch)
     with pytest.raises(DatasetError, match="was made again, but not the same"):
         if command == "generate":
             generate(tiny_dataset(), str(spoilable))
@@ -173,6 +172,53 @@ def test_other_code_does_not_replace_a_committed_shard(
     assert not (spoilable / shard.path).exists() and tree_hash(spoilable) == before
     monkeypatch.undo()
     repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+
+
+def other_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = LegModel.vertices
+    monkeypatch.setattr(LegModel, "vertices", lambda self, parameters, poses: real(self, parameters, poses) * 1.01)
+
+
+def test_what_is_refused_once_is_refused_again(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The dataset is being made anew from the first time on, as it has lost its faces."""
+    whole = tree_hash(spoilable)
+    flip_bit(spoilable / shards_of(tiny_dataset())[0].path)
+    (spoilable / "topology/0/faces/c/0/0").unlink()
+    other_code(monkeypatch)
+    for _ in range(2):
+        with pytest.raises(DatasetError, match="was made again, but not the same"):
+            repair(str(spoilable), tiny_dataset(), list(find_faults(str(spoilable))))
+    with pytest.raises(DatasetError, match="was made again, but not the same"):
+        generate(tiny_dataset(), str(spoilable))
+    monkeypatch.undo()
+    generate(tiny_dataset(), str(spoilable))
+    assert tree_hash(spoilable) == whole
+
+
+def test_committed_bytes_outlive_a_manifest_that_is_cut_short(
+    spoilable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of its begin and of its end six arrays each are written, and the root's attributes."""
+    whole = tree_hash(append(str(shutil.copytree(spoilable, tmp_path / "whole")), training=4).url)
+    shard, real = shards_of(tiny_dataset())[0].path, manifest.put_array
+    for cut in range(12):
+        url, left = shutil.copytree(spoilable, tmp_path / f"{cut}"), [cut]
+
+        def put(*given: Any, left: list[int] = left) -> None:
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+            real(*given)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(manifest, "put_array", put)
+            with pytest.raises(KeyboardInterrupt):
+                append(str(url), training=4)
+        (url / shard).unlink()
+        with monkeypatch.context() as patched, pytest.raises(DatasetError, match="was made again, but not the same"):
+            other_code(patched)
+            append(str(url), training=4)
+        assert not (url / shard).exists() and tree_hash(append(str(url), training=4).url) == whole
 
 
 def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
