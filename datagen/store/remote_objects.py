@@ -23,11 +23,13 @@ PATIENCE = 60.0
 """Seconds for which a remote store that does not answer is asked again."""
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 8.0
 _LISTED_FROM = 32  # so many sizes; a listing is a request for each thousand objects
+_ASKED_AT_ONCE = 16  # where it does not list; a small web server takes a few connections at a time
 S3_OPTIONS: dict[str, Any] = {
     "config_kwargs": {"connect_timeout": 10, "read_timeout": 30, "retries": {"max_attempts": 0}}
 }
 _CLOUDS = ("botocore", "aiobotocore", "aiohttp", "gcsfs", "google", "azure")
 _HOPELESS = ("NoCredentialsError", "PartialCredentialsError", "DefaultCredentialsError", "ProfileNotFound")
+_REFUSED = (401, 403, 405)  # of HTTP
 _TRANSIENT = (errno.EBUSY, errno.EIO, errno.EREMOTEIO, errno.ETIMEDOUT)
 
 
@@ -64,30 +66,43 @@ class RemoteObjects(FsspecStore):
         return found
 
     def sizes(self, paths: list[str]) -> dict[str, int]:
-        """Size of each path that exists: asked for concurrently, or listed where many are asked for."""
+        """Size of each path that exists: listed where many are asked for, else asked for one by one."""
         for path in paths:
             require_member(path)
+        listed: dict[str, int] = {}
         if len(paths) >= _LISTED_FROM:
             self.fs.invalidate_cache()
             listed = sync(self._patiently(self._listed_sizes))
-            return {path: listed[path] for path in paths if path in listed}
+        asked = asyncio.Semaphore(_ASKED_AT_ONCE)
 
-        async def size(path: str) -> tuple[str, int] | None:
+        async def size(path: str) -> int | None:
+            if path in listed:
+                return listed[path]
             try:
-                return path, await self.getsize(path)
+                async with asked:
+                    return await self.getsize(path)
             except FileNotFoundError:
                 return None
 
-        async def all_sizes() -> list[tuple[str, int] | None]:
-            return list(await asyncio.gather(*(size(path) for path in paths)))
+        async def all_sizes() -> list[int | None]:
+            return list(await asyncio.gather(*map(size, paths)))
 
-        return dict(found for found in sync(all_sizes()) if found is not None)
+        return {path: size for path, size in zip(paths, sync(all_sizes()), strict=True) if size is not None}
 
     async def _listed_sizes(self) -> dict[str, int]:
-        """Size of every object, some thousand by a request."""
-        found, root = await self.fs._find(self.path, detail=True), f"{self.path.strip('/')}/"
-        objects = ((path.lstrip("/").removeprefix(root), about) for path, about in found.items())
-        return {path: int(about["size"]) for path, about in objects if about["type"] == "file"}
+        """Size of every object, some thousand by a request; of none where the store does not list, or not sizes."""
+        try:
+            top = await self.fs._ls(self.path, detail=True)
+            if any(about["type"] == "file" and about["size"] is None for about in top):
+                return {}  # HTTP: a page for each folder, one after another, and no sizes
+            found = await self.fs._find(self.path, detail=True)
+        except Exception as error:
+            if _of_the_store(error) and not _is_hopeless(error):
+                raise
+            return {}
+        root = f"{self.path.strip('/')}/"
+        sizes = ((path.lstrip("/").removeprefix(root), about.get("size")) for path, about in found.items())
+        return {path: size for path, size in sizes if size is not None}
 
     def names(self) -> list[str]:
         """Names of what lies directly at the store's place."""
@@ -159,8 +174,9 @@ class RemoteObjects(FsspecStore):
 
 
 def _is_hopeless(error: Exception) -> bool:
-    """Whether it will be the same in a minute: no credentials, or not the right ones."""
-    return isinstance(error, PermissionError) or type(error).__name__ in _HOPELESS
+    """Whether it will be the same in a minute: no credentials, not the right ones, or not what is done there."""
+    refused = isinstance(error, PermissionError) or getattr(error, "status", None) in _REFUSED
+    return refused or type(error).__name__ in _HOPELESS
 
 
 def _of_the_store(error: Exception) -> bool:

@@ -4,8 +4,12 @@ import errno
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
+from threading import Thread
 from typing import Any
 from uuid import uuid4
 
@@ -139,6 +143,77 @@ def test_sizes_are_listed_where_many_are_asked_for(url: str, monkeypatch: pytest
         monkeypatch.setattr(remote_objects, "_LISTED_FROM", least)
         found.append(stored_sizes(group, paths))
     assert found[0] == found[1] and list(found[0]) == paths[:-1]
+
+
+@contextmanager
+def web_server(folder: Path, listing: str) -> Iterator[str]:
+    """Address of a web server of a folder, of which it shows a list of links, a page without any, or an error."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+        def list_directory(self, path: Any) -> Any:
+            if listing == "links":
+                return super().list_directory(path)
+            asked.append(self.path)
+            self.send_response(200 if listing == "none" else int(listing))
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            return None
+
+    class Server(ThreadingHTTPServer):
+        request_queue_size = 64
+
+    asked: list[str] = []
+    with Server(("127.0.0.1", 0), partial(Handler, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+    assert len(asked) < 10, "folders are not gone through where none is listed"
+
+
+@pytest.fixture(scope="module")
+def many_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of 72 shards; one of them is lost."""
+    place = tmp_path_factory.mktemp("served")
+    recipe = tiny_dataset(
+        identities={"training": 36, "evaluation": 0}, poses={"seen": 2, "unseen": 0}, store={"poses_per_shard": 1}
+    )
+    rows = generate(recipe, str(place / "legs.zarr")).manifest
+    assert len(rows) == 72
+    (place / "legs.zarr" / SHARD).unlink()
+    return place
+
+
+@pytest.mark.parametrize("listing", ["links", "none", "403", "404"])
+def test_sizes_over_http_are_those_of_the_files_whatever_the_server_lists(
+    many_shards: Path, monkeypatch: pytest.MonkeyPatch, listing: str
+) -> None:
+    monkeypatch.setattr(remote_objects, "PATIENCE", 2.0)
+    files = many_shards / "legs.zarr"
+    paths = [*objects_at(str(files)), SHARD]
+    with web_server(many_shards, listing) as address:
+        found = stored_sizes(open_group(f"{address}/legs.zarr"), paths)
+        assert found == {path: (files / path).stat().st_size for path in paths[:-1]}
+        with pytest.raises(DatasetError, match=rf"shard {SHARD} is missing. Repair"):
+            open_dataset(f"{address}/legs.zarr")
+
+
+def test_sizes_are_asked_for_where_listing_is_not_allowed(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a bucket whose objects may be read by those who may not list it."""
+    generate(tiny_dataset(), url)
+    paths, group = objects_at(url), open_group(url)
+    expected = stored_sizes(group, paths)
+    monkeypatch.setattr(remote_objects, "_LISTED_FROM", 1)
+
+    async def denied(*_: Any, **__: Any) -> None:
+        raise PermissionError(errno.EACCES, "Access Denied")
+
+    monkeypatch.setattr(group.store.fs, "_find", denied)
+    assert stored_sizes(group, paths) == expected and len(expected) == len(paths)
 
 
 # A real S3 API from here on.
