@@ -99,9 +99,10 @@ class Strips:
     """
 
     def __init__(self, of: NDArray[np.integer]) -> None:
-        self.of, self.sizes = of, np.bincount(of)
-        self._members, self._starts = np.argsort(of, kind="stable"), np.cumsum(self.sizes) - self.sizes
-        self._place = np.empty(len(of), np.int64)
+        self.of, self.sizes = of.astype(np.int32), np.bincount(of).astype(np.int32)
+        self._members = np.argsort(of, kind="stable").astype(np.int32)
+        self._starts = (np.cumsum(self.sizes) - self.sizes).astype(np.int32)
+        self._place = np.empty(len(of), np.int32)
         self._place[self._members] = np.arange(len(of)) - self._starts[of[self._members]]
 
     @property
@@ -109,13 +110,13 @@ class Strips:
         """How many groups of two strips there are; the last one has three where their number is odd."""
         return max(1, len(self.sizes) // 2)
 
-    def group(self, place: NDArray[np.int64]) -> NDArray[np.int64]:
+    def group(self, place: NDArray[np.integer]) -> NDArray[np.integer]:
         """The group of a strip at a place of a shuffled list of strips."""
         return np.minimum(place // 2, self.groups - 1)
 
     def others(
-        self, random: np.random.Generator, of: NDArray[np.integer], lists: NDArray[np.int64], which: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
+        self, random: np.random.Generator, of: NDArray[np.int32], lists: NDArray[np.int32], which: NDArray[np.integer]
+    ) -> NDArray[np.int32]:
         """Another than each of ``of`` [n], from its strip or another one of its group.
 
         Over all lists each other is drawn alike often, where strips are equally long; what lies in a shorter one a
@@ -129,16 +130,31 @@ class Strips:
             The list that holds for each [n].
         """
         strip, count = self.of[of], len(self.of)
-        size, place = self.sizes[strip], np.argsort(lists, axis=1)[which, strip]
+        place = _places(lists)[which, strip]
         first = 2 * self.group(place)
-        strips = np.where(first == 2 * (self.groups - 1), len(self.sizes) - first, 2)
-        next_to = first + (place - first + 1 + random.integers(0, np.maximum(strips - 1, 1))) % strips
+        strips = np.where(first == 2 * (self.groups - 1), len(self.sizes) - first, 2).astype(np.int32)
+        next_to = first + (place - first + 1 + _below(random, np.maximum(strips - 1, 1))) % strips
+        del place, first, strips
         elsewhere = lists[which, next_to]
-        there = self._starts[elsewhere] + random.integers(0, self.sizes[elsewhere])
-        here = self._starts[strip] + (self._place[of] + 1 + random.integers(0, np.maximum(size - 1, 1))) % size
+        del next_to
+        there = self._starts[elsewhere] + _below(random, self.sizes[elsewhere])
+        size = self.sizes[strip]
+        here = self._starts[strip] + (self._place[of] + 1 + _below(random, np.maximum(size - 1, 1))) % size
+        del strip
         away = (count - size) / max(count - 1, 1) * self.sizes[elsewhere] / self.sizes.max()
-        is_away = random.random(len(of)) < np.where(size == 1, 1.0, away)  # one that is alone has nothing else here
-        return self._members[np.where(is_away, there, here)]
+        away[size == 1] = 1.0  # one that is alone has nothing else here
+        del size, elsewhere
+        return self._members[np.where(random.random(len(of)) < away, there, here)]
+
+
+def _places(lists: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The place of each strip in shuffled lists [list, strip]."""
+    return np.argsort(lists, axis=-1).astype(np.int32)
+
+
+def _below(random: np.random.Generator, ends: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A number from 0 to below each of some ends."""
+    return random.integers(0, ends).astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -226,21 +242,38 @@ class BlockOrder(TripleOrder):
         """An epoch's triples, by the dataset's numbers of identities and poses."""
         random = generator(self.seed, Stream.TRAINING_TRIPLES, number)
         rows, columns = self.block.rows, self.block.columns
-        target, source_pose = np.divmod(random.permutation(self.cells), len(self.poses))
-        column_list = random.permutation(len(columns.sizes))[None]
-        row_lists = random.permuted(np.tile(np.arange(len(rows.sizes)), (columns.groups, 1)), axis=1)
-        group = columns.group(np.argsort(column_list[0])[columns.of[source_pose]])
-        tile = group * rows.groups + rows.group(np.argsort(row_lists, axis=1)[group, rows.of[target]])
+        target, source_pose = self._cells(random)
+        column_list = random.permutation(len(columns.sizes)).astype(np.int32)[None]
+        row_lists = np.tile(np.arange(len(rows.sizes), dtype=np.int32), (columns.groups, 1))
+        row_lists = random.permuted(row_lists, axis=1)
+        group = columns.group(_places(column_list[0])[columns.of[source_pose]])
+        tile = group * rows.groups + rows.group(_places(row_lists)[group, rows.of[target]])
         source = rows.others(random, target, row_lists, group)
-        target_pose = columns.others(random, source_pose, column_list, np.zeros_like(group))
+        del group
+        target_pose = columns.others(random, source_pose, column_list, np.zeros_like(tile))
+        order = np.argsort(random.permutation(self.block.tiles).astype(np.int32)[tile], kind="stable")
+        del tile
+        order = order[self._mixed(random)]
         identities, poses = np.asarray(self.identities), np.asarray(self.poses)
-        triples = np.stack([identities[source], poses[source_pose], identities[target], poses[target_pose]], axis=1)
-        return self._mixed(random, triples[np.argsort(random.permutation(self.block.tiles)[tile], kind="stable")])
+        triples = np.empty((self.cells, 4), np.int64)
+        numbers = ((identities, source), (poses, source_pose), (identities, target), (poses, target_pose))
+        for column, (named, each) in enumerate(numbers):
+            triples[:, column] = named[each[order]]
+        return triples
 
-    def _mixed(self, random: np.random.Generator, triples: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Triples tile by tile, in the order of the batches: put off, and dealt to the lanes."""
+    def _cells(self, random: np.random.Generator) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Target identity and source pose of each cell, in any order."""
+        cells, poses = random.permutation(self.cells), len(self.poses)
+        target = (cells // poses).astype(np.int32)
+        cells %= poses
+        return target, cells.astype(np.int32)
+
+    def _mixed(self, random: np.random.Generator) -> NDArray[np.int64]:
+        """Places of triples that lie tile by tile, in the order of the batches: put off, and dealt to the lanes."""
         steps, width = self.steps_per_epoch, self.batch // self.lanes
-        lanes = np.arange(steps * self.batch).reshape(self.lanes, steps * width)
-        order = np.argsort(np.arange(steps * width) + random.uniform(0, self.reach, lanes.shape), axis=1, kind="stable")
-        dealt = np.take_along_axis(lanes, order, axis=1).reshape(self.lanes, steps, width).swapaxes(0, 1).ravel()
-        return np.concatenate([triples[dealt], triples[len(dealt) :]])
+        places, lane = np.arange(self.cells), steps * width
+        dealt = places[: steps * self.batch].reshape(steps, self.lanes, width)
+        for number in range(self.lanes):
+            order = np.argsort(np.arange(lane) + random.uniform(0, self.reach, lane), kind="stable")
+            dealt[:, number] = (number * lane + order).reshape(steps, width)
+        return places
