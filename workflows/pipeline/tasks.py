@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from datagen.generate import Runner, Task, ensure_shards, inline, ray_runner
+from datagen.generate.plan import draw_rotations
 from datagen.recipe import DatasetRecipe
 from datagen.store import Dataset
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
@@ -61,8 +62,9 @@ class TaskRunner:
             here = self._decide("generate", meshes, "meshes", ray_from(arguments[0][1]))
         else:  # what comes before the shards; a number is as much work as a mesh or so
             numbers = sum(len(numbers) for _, _, *given in arguments for numbers in given)
+            unit = "poses" if task is draw_rotations else "identities"
             many = numbers >= RAY_FROM_MESHES
-            here = self._decide("generate", numbers, "numbers to draw", RAY_FROM_MESHES) if many else not on_cluster()
+            here = self._decide("generate", numbers, unit, RAY_FROM_MESHES) if many else not on_cluster()
         return self._run(task, arguments, here=here)
 
     def measure(self, dataset: Dataset, recipe: EvaluationRecipe) -> Runner:

@@ -70,13 +70,21 @@ def test_a_large_one_is_made_on_ray_which_ends_with_the_block(
     assert len(ray_starts) == 3 and "in this process (--local)" in capsys.readouterr().err
 
 
-def test_many_identities_are_described_on_ray(
-    tmp_path: Any, ray_starts: list[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("least", "said"), [(10, ["10 poses"]), (5, ["5 identities", "10 poses"])])
+def test_many_identities_are_described_and_many_poses_drawn_on_ray(
+    tmp_path: Any,
+    ray_starts: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    least: int,
+    said: list[str],
 ) -> None:
-    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", 10)
+    monkeypatch.setattr(tasks, "RAY_FROM_MESHES", least)
     with TaskRunner() as runner:
         generate(tiny_dataset(), str(tmp_path / "x.zarr"), run=runner.make_shards)
-    assert ray_starts.count("tasks") == 2  # ten poses and the shards, but not five identities
+    assert ray_starts.count("tasks") == len(said) + 1  # and the shards
+    lines = [f"generate: {what}, on Ray (Ray from {least})" for what in [*said, "38 meshes"]]
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_meshes_that_take_long_are_worth_rays_start_sooner() -> None:
