@@ -43,7 +43,7 @@ class EvaluationTriples(Frozen):
 class StoreRecipe(Frozen):
     """Layout of the store."""
 
-    poses_per_shard: int = Field(100, ge=1, description="meshes in one shard file; one task writes one shard")
+    poses_per_shard: int = Field(100, ge=1, description="meshes in one shard file; a task writes one or several")
     codec: Literal["lz4", "zstd"] = Field("lz4", description="compressor inside Blosc, after byte shuffle")
     compression_level: int = Field(5, ge=1, le=9, description="level of the compressor")
 

@@ -10,7 +10,9 @@ from training.networks import network_from
 from training.recipes.training import TrainingRecipe
 from training.tracking.provenance import cores
 
-_MORE = 1.6  # starts, batches, losses and measurements beside: the quickstart's two trainings took 1.6 and 1.7 times
+_MORE = 1.6
+"""A run's time over that of its steps alone: starts, batches, losses and measurements come on top. The quickstart's two
+trainings took 1.6 and 1.7 times as long; the lower is taken."""
 _SECONDS = 1.0  # how long steps are tried, after a first one
 _LONG = 5.0  # a first step beyond which there is no second
 _VERTICES = 4096  # of the meshes of a trial: examples beyond them are counted, not tried
