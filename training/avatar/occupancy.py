@@ -78,7 +78,8 @@ def frame_samples(
     low, high = field.low.numpy(), field.high.numpy()
     places = torch.from_numpy(random.uniform(low, high, (count // _FREE, 3))).float()
     free = torch.from_numpy(_depth_in_any(scan, deformation.posed(places).numpy()) < -_BLUR)
-    themselves = torch.stack([free, *(2 * [torch.zeros_like(free)])], dim=1)
+    themselves = torch.zeros(len(free), roots.shape[1], dtype=torch.bool)
+    themselves[:, 0] = free
     return FrameSamples(
         torch.cat([roots, places[:, None].expand(-1, roots.shape[1], -1)]),
         torch.cat([valid & (on_hand < 0.5), themselves]),
