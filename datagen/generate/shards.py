@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +45,21 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
     return meshes
 
 
-@lru_cache(maxsize=128)
+_kept: dict[tuple[str, range], Poses] = {}
+_keeping = Lock()
+_KEPT_POSES = 12_800
+"""So many poses that earlier shards of a process had: 30 MB with the world rotations of SMPL's joints."""
+
+
 def _poses(recipe: str, numbers: range) -> Poses:
-    """The poses of a shard, kept with their world rotations for the next identities (0.2 MB for 100 of SMPL's)."""
-    return draw_poses(PoseRecipe.model_validate_json(recipe), numbers)
+    """The poses of a shard, kept for the next identities, whose shards have the same blocks of poses."""
+    key = recipe, numbers
+    with _keeping:
+        poses = _kept.pop(key, None) or draw_poses(PoseRecipe.model_validate_json(recipe), numbers)
+        _kept[key] = poses
+        while sum(map(len, _kept.values())) > _KEPT_POSES:  # the block that was asked for longest ago
+            del _kept[next(iter(_kept))]
+    return poses
 
 
 def _meshes(recipe: DatasetRecipe, body: BodyModel, identity: int, shard: Shard, poses: Poses) -> NDArray[np.float32]:
