@@ -8,14 +8,14 @@ the bytes come out the same.
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 from pydantic import ValidationError
 
 from datagen.bodies import load_body
 from datagen.common.errors import BodyError, DatasetError, DsffnetError, RecipeError, StorageError
 from datagen.generate.plan import assets_of, prepare
-from datagen.generate.runners import Progress, Runner, Task, inline, ray_runner, unseen
+from datagen.generate.runners import Progress, Runner, Task, closable, inline, ray_runner, unseen
 from datagen.generate.shards import Wanted, batches, ensure_shards, make_shard
 from datagen.grid import Grid, Place
 from datagen.recipe import DatasetRecipe, Growth
@@ -199,9 +199,9 @@ def _make_missing(
         else:
             missing.append((shard, row.sha256 if row else None))
     tasks = [(url, recipe, some) for some in batches(recipe, missing)]
-    results = ((sum(row.rows for row in made), made) for made in run(ensure_shards, tasks))
     done = sum(row.rows for row in rows)
-    with _saving(url, recipe, rows, doubted) as add:
+    with closing(closable(run(ensure_shards, tasks))) as ran, _saving(url, recipe, rows, doubted) as add:
+        results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
     finish(url, recipe, rows)

@@ -1,7 +1,7 @@
 """Where tasks run: one after another in this process, or on a Ray cluster."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 from datagen.common.errors import ClusterError
@@ -26,6 +26,11 @@ def unseen(results: Iterator[tuple[int, Any]], **amounts: Any) -> Iterator[Any]:
 def inline(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
     """Run tasks one after another in this process."""
     return (task(*each) for each in arguments)
+
+
+def closable(results: Iterator[Any]) -> Generator[Any]:
+    """The results of a runner; closing them ends its tasks."""
+    yield from results
 
 
 def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:

@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -10,7 +11,7 @@ import pytest
 from zarr.storage import FsspecStore
 
 from datagen import generate as generation
-from datagen.common.errors import DatasetError
+from datagen.common.errors import DatasetError, StorageError
 from datagen.generate import append, ensure_shards, generate, identities, inline, plan, shards
 from datagen.generate.identities import describe_identities, joined
 from datagen.recipe import DatasetRecipe
@@ -139,6 +140,48 @@ def test_a_note_of_the_shards_so_far_is_kept_for_a_process_that_is_killed(
     run = Watched()
     generate(tiny_dataset(), url, run=run)
     assert sum(len(some) for (some,) in run.of("ensure_shards")) == 9 and tree_hash(url) == tree_hash(dataset)
+
+
+def test_tasks_have_ended_when_the_lock_is_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a manifest of the shards so far cannot be saved, say, while others are being made."""
+    seen, real = list[str](), generation.writing_alone
+
+    @contextmanager
+    def alone(url: str) -> Iterator[None]:
+        with real(url):
+            try:
+                yield
+            finally:
+                seen.append("lock given back")
+
+    def running(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        try:
+            yield from inline(task, arguments)
+        finally:
+            if task is ensure_shards:
+                seen.append("tasks ended")
+
+    def full(url: str, recipe: DatasetRecipe, rows: Any) -> None:
+        raise StorageError("the disk is full")
+
+    monkeypatch.setattr(generation, "_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(generation, "writing_alone", alone)
+    monkeypatch.setattr(generation, "save", full)
+    with pytest.raises(StorageError, match="the disk is full"):
+        generate(tiny_dataset(), str(tmp_path / "leg.zarr"), run=running)
+    assert seen == ["tasks ended", "lock given back"]
+
+
+def test_few_poses_are_kept_for_the_next_identities_however_many_a_shard_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = tiny_dataset().poses.model_dump_json()
+    monkeypatch.setattr(shards, "_kept", {})
+    monkeypatch.setattr(shards, "_KEPT_POSES", 20)
+    small = [shards._poses(recipe, range(start, start + 5)) for start in range(0, 20, 5)]
+    assert all(shards._poses(recipe, range(start, start + 5)) is small[start // 5] for start in range(0, 20, 5))
+    large = shards._poses(recipe, range(12))
+    assert shards._poses(recipe, range(12)) is large and sum(map(len, shards._kept.values())) == 17
+    shards._poses(recipe, range(30))
+    assert not shards._kept, "not even one that is larger than all that is kept"
 
 
 def test_a_shard_that_shrank_since_is_made_again_and_one_of_its_size_is_found_by_verify(
