@@ -6,11 +6,14 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
 
+hypothesis.settings.register_profile("busy", deadline=None)  # a machine that others use has slow moments
+hypothesis.settings.load_profile("busy")
 _MLFLOW = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")
 
 

@@ -87,7 +87,7 @@ def test_a_batch_gives_what_single_poses_give_to_the_bit(family: Family) -> None
 
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name != "imported"], indirect=True)
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(number=st.integers(0, 50), seed=st.integers(0, 99))
 def test_its_rig_gives_its_vertices_without_it(family: Family, number: int, seed: int) -> None:
     """Within ten micrometres, for random identities and random rotations of every joint that its poses turn.

@@ -47,7 +47,7 @@ def interrupted_runner(order: list[int], stop_after: int) -> generation.Runner:
 
 
 @given(st.permutations(range(12)), st.integers(0, 11), st.integers(0, 3))
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_order_and_any_interruption_give_the_same_bytes(
     dataset: str, tmp_path_factory: pytest.TempPathFactory, order: list[int], stop_after: int, again: int
 ) -> None:

@@ -44,7 +44,7 @@ def test_every_format_becomes_every_other_with_its_vertices_in_order(tmp_path: P
     assert np.allclose(loaded.triangles, moved[read.mesh.faces], atol=1e-6)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000), st.sampled_from(sorted(set(FORMATS) - {".stl"})))
 def test_any_triangles_come_back_as_they_were(tmp_path_factory: pytest.TempPathFactory, seed: int, suffix: str) -> None:
     generator = np.random.default_rng(seed)

@@ -59,7 +59,7 @@ def test_what_zarr_writes_is_read_here(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 10**9), st.sampled_from(["flip", "cut", "zero"]))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_spoiled_bytes_are_never_wrong_meshes(place: int, how: str) -> None:
     codec = ShardCodec(2, 3, 30, "lz4", 5)
     content = bytearray(codec.encode(meshes(2, 2, 30)))

@@ -111,7 +111,7 @@ def test_normal_angle_error_counts_faces_once_and_treats_flat_ones_as_documented
     assert metrics.normal_angle_error(truth, collapsed, faces).tolist() == [0.0]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(pairs)
 def test_bounds_between_metrics(pair: tuple[Tensor, Tensor]) -> None:
     prediction, truth = pair
@@ -122,7 +122,7 @@ def test_bounds_between_metrics(pair: tuple[Tensor, Tensor]) -> None:
     assert (metrics.mean_euclidean_error(prediction, truth) <= (3 * distance).sqrt() + slack).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(pairs, st.integers(0, 10**6))
 def test_set_metrics_ignore_the_order_of_vertices_and_are_symmetric(pair: tuple[Tensor, Tensor], seed: int) -> None:
     prediction, truth = pair

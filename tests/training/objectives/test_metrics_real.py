@@ -74,7 +74,7 @@ def batch(*meshes: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(np.stack(meshes))
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     kind=st.integers(0, 1),
     pair=st.tuples(st.integers(0, 5), st.integers(0, 5)),
