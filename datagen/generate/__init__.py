@@ -190,6 +190,8 @@ def _make_missing(
     known = known_shards(url, {fault.path for fault in faults})
     lost = [fault.path for fault in faults if not fault.shard]
     arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, so_far=known)
+    if faults:  # before anything is made: a run after this one must know what is faulty
+        save(url, recipe, known)
     sound, rows, missing = {row.place for row in known.sound}, list[ManifestRow](), list[Wanted]()
     doubted = {row.place: row for row in (*known.sound, *known.doubted)}
     for shard in arrays.shards():

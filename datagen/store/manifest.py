@@ -167,18 +167,23 @@ def put_so_far(group: zarr.Group, so_far: SoFar) -> None:
 
 
 def read_so_far(group: zarr.Group) -> SoFar | None:
-    """What :func:`put_so_far` kept; None where there is nothing, or something else."""
+    """What :func:`put_so_far` kept; None where there is nothing.
+
+    Raises
+    ------
+    ValueError
+        It is damaged.
+    """
     try:
         content = read_bytes(group, _SO_FAR)
-    except (OSError, UnsafeFileError):
+    except (OSError, UnsafeFileError) as error:
+        raise ValueError(_SO_FAR) from error
+    if content is None:
         return None
-    if content is None or hashlib.sha256(content[32:]).digest() != content[:32]:
-        return None
-    try:
-        table = np.frombuffer(content[32:], _SO_FAR_ROW)
-        _require_places(table["place"])
-    except ValueError:
-        return None
+    if hashlib.sha256(content[32:]).digest() != content[:32]:
+        raise ValueError(_SO_FAR)
+    table = np.frombuffer(content[32:], _SO_FAR_ROW)
+    _require_places(table["place"])
     rows = Manifest({name: table[name] for name in _COLUMNS}, {}).shards
     both: tuple[list[ManifestRow], list[ManifestRow]] = [], []
     for row, sound in zip(rows, table["sound"], strict=True):

@@ -28,7 +28,7 @@ _MEMBER = re.compile(
 )
 MEMBERS = ("grid", "topology", "pose", "evaluation", "rig", "manifest")
 """The groups that a dataset's root holds; ``rig`` only where bodies have one."""
-_LEFTOVER = re.compile(r"(?:[a-z0-9_]+/)*[a-z0-9]+\.[0-9a-f]+\.partial")
+_LEFTOVER = re.compile(r"(?:[a-z0-9_]+/)*[a-z0-9_]+\.[0-9a-f]+\.partial")
 """What a killed writer leaves of an object."""
 LONGEST_LIST = 2**27
 """Bytes of zarr.json and manifest/zarr.json, which grow with the steps and the topologies of a dataset."""

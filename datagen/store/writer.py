@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError, NoDataset, ShardDamage, UnsafeFileError, storage_errors
+from datagen.common.errors import DatasetError, NoDataset, ShardDamage, StorageError, UnsafeFileError, storage_errors
 from datagen.grid import HOLE, Grid, GridArray, GridArrays, PoseType, Shard
 from datagen.mesh.geometry import Bounds
 from datagen.mesh.geometry import bounds as bounds_of
@@ -158,21 +158,22 @@ def begin(
         check_same_recipe(url, group, before)
         if not lost:
             check_same_assets(url, group, plan.attributes["body"]["assets"])
-        present = attributes_of(group)
-        so_far = so_far or SoFar()
-        if rows := [*so_far.sound, *so_far.doubted]:
-            put_so_far(group, so_far)
+        present, stated = attributes_of(group), dict(wanted)
         if growing or lost:
-            made_by = with_history(plan.provenance, present.get("provenance"))
-            group.update_attributes({**wanted, "status": "building", "provenance": made_by})
-        elif {key: present.get(key) for key in wanted} != wanted:
-            group.update_attributes(wanted)
+            stated["provenance"] = with_history(plan.provenance, present.get("provenance"))
+        differs = growing or bool(lost) or {key: present.get(key) for key in wanted} != wanted
+        so_far = so_far or SoFar()
+        if differs or _is_building(group):
+            put_so_far(group, so_far)
+        if differs:  # from here on without a seal, until the manifest is committed
+            kept = {key: value for key, value in present.items() if key != SEAL}
+            group.attrs.put({**kept, **stated, "status": "building"})
         for path in lost:
             if path != "zarr.json":
                 delete_object(group, path)
         _put_arrays(group, plan)
         if _is_building(as_it_is_now := open_group(url, mode="r+")):
-            commit(as_it_is_now, rows, {})
+            commit(as_it_is_now, [*so_far.sound, *so_far.doubted], {})
 
 
 def _is_building(group: zarr.Group) -> bool:
@@ -310,16 +311,19 @@ def begun(url: str, recipe: DatasetRecipe, attributes: Mapping[str, Any]) -> Gri
 def known_shards(url: str, faulty: Collection[str] = ()) -> SoFar:
     """The shards that were written before: sound are those that are there, of the size that was written.
 
-    None is sound where what is said of them is not to be believed: the root's attributes were changed, or they or the
-    manifest are among the ``faulty`` objects.
+    None is sound where what is said of them is not to be believed: the root's attributes were changed, they or the
+    manifest are among the ``faulty`` objects, or what was kept of a dataset in the making is damaged.
     """
     try:
         group = open_group(url)
     except NoDataset:
         return SoFar()
     manifest = read_manifest(group)
-    so_far = read_so_far(group) if _is_building(group) else None
-    so_far = so_far or SoFar(manifest.shards if manifest else ())
+    so_far = SoFar(manifest.shards if manifest else ())
+    try:
+        so_far = (read_so_far(group) if _is_building(group) else None) or so_far
+    except ValueError:
+        so_far = SoFar(doubted=so_far.sound)
     believed = is_sealed(group) or SEAL not in attributes_of(group)
     if not believed or any(path == "zarr.json" or path.startswith("manifest/") for path in faulty):
         return SoFar(doubted=[*so_far.sound, *so_far.doubted])
@@ -365,7 +369,10 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
         objects = manifest.objects if manifest else None
         put_so_far(group, SoFar(rows))
         commit(group, rows, {"statistics": statistics, "status": "complete"}, objects=objects)
-        delete_so_far(group)
+        with contextlib.suppress(
+            StorageError
+        ):  # the dataset is complete, and where nothing may be removed it is ignored
+            delete_so_far(group)
 
 
 def _writing(url: str) -> contextlib.AbstractContextManager[None]:

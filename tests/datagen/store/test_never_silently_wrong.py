@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,13 @@ import pytest
 
 from datagen.bodies.leg import LegModel
 from datagen.common.assets import Asset
-from datagen.common.errors import BodyError, DatasetError
-from datagen.generate import append, ensure_shards, generate, make_shard, repair
+from datagen.common.errors import BodyError, DatasetError, StorageError
+from datagen.generate import append, ensure_shards, generate, inline, make_shard, repair, shards
 from datagen.generate.plan import plan_of
 from datagen.generate.shards import require_same_assets
 from datagen.mesh.geometry import bounds
 from datagen.recipe import DatasetRecipe
-from datagen.store import manifest, open_dataset
+from datagen.store import manifest, open_dataset, writer
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from datagen.store.writer import ShardWriter
@@ -219,6 +220,41 @@ def test_committed_bytes_outlive_a_manifest_that_is_cut_short(
             other_code(patched)
             append(str(url), training=4)
         assert not (url / shard).exists() and tree_hash(append(str(url), training=4).url) == whole
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_what_verify_found_stays_doubted_after_a_repair_that_is_cut_short(spoilable: Path, damaged: bool) -> None:
+    def stopped(task: Any, arguments: list[Any]) -> Iterator[Any]:
+        if task is ensure_shards:
+            raise StorageError("no room")
+        return inline(task, arguments)
+
+    whole = tree_hash(append(str(shutil.copytree(spoilable, spoilable.parent / "whole")), training=4).url)
+    with pytest.raises(StorageError):
+        append(str(spoilable), training=4, run=stopped)
+    flip_bit(spoilable / shards_of(tiny_dataset())[0].path)
+    grown = open_group(str(spoilable)).attrs["recipe"]
+    recipe = DatasetRecipe.model_validate(grown)
+    with pytest.raises(StorageError):
+        repair(str(spoilable), recipe, list(find_faults(str(spoilable))), run=stopped)
+    if damaged:
+        (spoilable / "manifest/so_far").write_bytes(b"")
+    assert tree_hash(append(str(spoilable), training=4).url) == whole
+
+
+def test_an_append_cut_short_while_it_begins_reads_no_shard_afterwards(
+    spoilable: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what a writer leaves of the note of its shards that it was writing is removed at the end."""
+    whole = tree_hash(append(str(shutil.copytree(spoilable, tmp_path / "whole")), training=4).url)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(writer, "_put_arrays", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        append(str(spoilable), training=4)
+    (spoilable / f"manifest/so_far.{'0' * 32}.partial").write_bytes(b"half")
+    looked, real = list[Any](), shards.existing_shard
+    monkeypatch.setattr(shards, "existing_shard", lambda *given: looked.append(given[2]) or real(*given))
+    assert tree_hash(append(str(spoilable), training=4).url) == whole
+    assert looked and {identity for shard in looked for identity in shard.identities} == {5}
 
 
 def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
