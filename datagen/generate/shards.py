@@ -48,7 +48,7 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
 _kept: dict[tuple[str, range], Poses] = {}
 _keeping = Lock()
 _KEPT_POSES = 12_800
-"""So many poses that earlier shards of a process had: 30 MB with the world rotations of SMPL's joints."""
+"""Poses of earlier shards that a process keeps: some 30 MB with the world rotations of SMPL's joints."""
 
 
 def _poses(recipe: str, numbers: range) -> Poses:

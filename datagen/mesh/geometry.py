@@ -54,6 +54,7 @@ _GROUP = 128
 
 
 def _bound(extreme: np.ufunc, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The extreme coordinates [mesh, 3] of meshes [mesh, vertex, 3]."""
     found, groups = vertices, vertices.shape[1] // _GROUP
     if groups:
         grouped = vertices[:, : groups * _GROUP].reshape(len(vertices), groups, 3 * _GROUP)

@@ -177,7 +177,7 @@ def begin(
 
 
 def _is_building(group: zarr.Group) -> bool:
-    """Whether nobody has completed it meanwhile, as on a store without a lock."""
+    """Whether it is being made, and nobody has completed it meanwhile, as on a store without a lock."""
     return attributes_of(group).get("status") == "building"
 
 
