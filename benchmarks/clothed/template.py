@@ -42,6 +42,7 @@ from training.avatar.template import (
     pose_condition,
     template_loss,
 )
+from training.engine.optimization.muon import Muon
 from training.networks.template import OccupancyTemplate
 from training.viz.mesh_grid import Panel, Row, mesh_grid
 
@@ -197,8 +198,8 @@ class Run:
         hands = hand_samples(random, subject.body, 4000)
         centre, radius = (body.min(axis=0) + body.max(axis=0)) / 2, float(np.ptp(body, axis=0).max() / 2)
         network = OccupancyTemplate(centre=centre.tolist(), radius=radius, width=self.width)
-        adam = torch.optim.Adam(network.parameters(), 1e-3)
-        falling = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps)
+        muon = Muon(network.parameters(), lr=0.004, betas=(0.9, 0.999), eps=1e-8, weight_decay=0.0)
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(muon, self.steps)
         for step in range(self.steps):
             if step % _EVERY == 0:
                 self.measure(step, network, samples, conditions)
@@ -206,10 +207,10 @@ class Run:
             near_hands = torch.from_numpy(random.choice(4000, 300))
             batch = FrameSamples(*(each[:, torch.from_numpy(points)] for each in _some(samples, rows)))
             loss = template_loss(network, batch, conditions[rows], (hands[0][near_hands], hands[1][near_hands]))
-            adam.zero_grad()
+            muon.zero_grad()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 0.1)
-            adam.step()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            muon.step()
             falling.step()
         self.measure(self.steps, network, samples, conditions)
         return network

@@ -15,9 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from datagen.bodies.clothed.draping import depths
+from datagen.bodies.clothed.model import ClothedModel, body_faces
+from datagen.bodies.skinning import skin
 from datagen.generate import inline
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.mesh.parts import part_colors
+from datagen.poses import Poses
 from datagen.recipe import ClothedBody, MixedBody
 from datagen.store import Dataset, open_dataset
 from training.data.batch import read_batch
@@ -30,6 +34,7 @@ from training.viz.mesh_grid import Row as Drawn
 from workflows.pretrained import weights_named
 
 _EMD_POINTS = 512
+_DEEP_METRES = 0.002
 _BARE, _TRUTH = "bare", "the truth"
 _SHOWN = ("pmd", "chamfer", "earth_mover", "millimetres", "edge_ratio", "normal_degrees")
 
@@ -44,6 +49,7 @@ class People:
         recipe = mixed.bodies[1]
         assert isinstance(recipe, ClothedBody), recipe
         self.outfits = recipe.outfits
+        self._model = ClothedModel(recipe)
 
     def worn(self, identity: int) -> str:
         """The name of an identity's outfit."""
@@ -52,6 +58,15 @@ class People:
     def mesh(self, identity: int, pose: int) -> Mesh:
         """An identity in a pose as it is stored, metres."""
         return Mesh(self.dataset.vertices(identity, pose).astype(np.float64), self.dataset.faces(identity))
+
+    def share_within(self, mesh: Mesh, identity: int, pose: int) -> float:
+        """Of the vertices of an identity's garments, the share deeper than 2 mm in its whole body in the true pose."""
+        attributes, part = self.dataset.attributes, self.dataset.part(identity)
+        assert part is not None, identity
+        poses = Poses(tuple(attributes["joints"]), tuple(attributes["joint_parents"]), self.dataset.rotations()[[pose]])
+        person = self._model.person(tuple(self._own(identity)))
+        body = skin(person.body, self._model.world_rotations(poses))[0]
+        return float(np.mean(depths(mesh.vertices[part > 0].astype(np.float32), body, body_faces()) > _DEEP_METRES))
 
     def _own(self, identity: int) -> list[float]:
         names, values = self.dataset.attributes["body"]["parameters"], self.dataset.parameters(identity)
@@ -84,18 +99,39 @@ def outputs(people: People, methods: Sequence[Method], triples: NDArray[np.integ
     return made
 
 
-def table(people: People, rows: Sequence[Row]) -> None:
+def shares_within(people: People, methods: Sequence[Method], rows: Sequence[Row]) -> dict[tuple[str, int], float]:
+    """Of each method and triple onto a dressed target, the share of its garments that lies within the body."""
+    triples = {row.triple: row for row in rows if people.worn(row.target_identity) != _BARE}
+    found = dict[tuple[str, int], float]()
+    for number, row in sorted(triples.items()):
+        target, pose = row.target_identity, row.source_pose
+        made = outputs(people, methods, np.array([(row.source_identity, pose, target, row.target_pose)]))
+        found |= {(name, number): people.share_within(meshes[0], target, pose) for name, meshes in made.items()}
+    return found
+
+
+def table(people: People, methods: Sequence[Method], rows: Sequence[Row]) -> None:
     """One line for each outfit and method, as Markdown."""
+    within = shares_within(people, methods, rows)
     columns = [column for column in COLUMNS if column.field in _SHOWN]
     headings = ["PMD x1e-4", "from bare", "from dressed", "median", *(its.heading for its in columns[1:])]
-    headings += [its.heading for its in DRESSED_COLUMNS]
+    headings += [*(its.heading for its in DRESSED_COLUMNS), "in body"]
     print("| target | method |", " | ".join(headings), "|")
     print("|---|---|", "---:|" * len(headings), sep="")
     for outfit in (_BARE, *people.outfits):
         its = [row for row in rows if people.worn(row.target_identity) == outfit]
         for method in dict.fromkeys(row.method for row in its):
-            cells = _cells(people, [row for row in its if row.method == method], columns)
+            ours = [row for row in its if row.method == method]
+            shares = [within[method, row.triple] for row in ours if (method, row.triple) in within]
+            cells = [*_cells(people, ours, columns), f"{np.mean(shares):.1%}" if shares else ""]
             print(f"| `{outfit}` | {method} |", " | ".join(cells), "|")
+        shares = [
+            within[_TRUTH, number] for number in sorted({row.triple for row in its}) if (_TRUTH, number) in within
+        ]
+        if shares:
+            print(
+                f"| `{outfit}` | {_TRUTH} |", " | ".join([*[""] * (len(headings) - 1), f"{np.mean(shares):.1%}"]), "|"
+            )
 
 
 def _cells(people: People, rows: Sequence[Row], columns: Sequence[Column]) -> list[str]:
@@ -162,6 +198,6 @@ if __name__ == "__main__":
     its_about = EvaluationRecipe(emd_points=_EMD_POINTS, triples=given.triples)
     its_people = People(open_dataset(given.data), its_about)
     if given.what == "table":
-        table(its_people, measured(its_people, given.folder, given.methods))
+        table(its_people, given.methods, measured(its_people, given.folder, given.methods))
     else:
         picture(its_people, given.methods, measured(its_people, given.folder, given.methods), given.picture)
