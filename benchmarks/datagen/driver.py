@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.datagen.dataset_shape import recipe_of
 from datagen.generate import generate, ray_runner
 from datagen.generate.plan import plan_of
 from datagen.recipe import DatasetRecipe
@@ -21,8 +20,8 @@ from workflows.pipeline.ray_cluster import ray_cluster
 
 def one_a_shard(identities: int) -> DatasetRecipe:
     """Legs in ten poses, each mesh a shard of its own."""
-    recipe = recipe_of(identities, 10)
-    return recipe.model_copy(update={"store": recipe.store.model_copy(update={"poses_per_shard": 1})})
+    sizes = {"identities": {"training": identities, "evaluation": 0}, "poses": {"seen": 10, "unseen": 0}}
+    return DatasetRecipe.model_validate({"body": {"family": "leg"}, **sizes, "store": {"poses_per_shard": 1}})
 
 
 def handing_out(recipe: DatasetRecipe) -> float:
