@@ -78,7 +78,7 @@ def main() -> None:
     print(f"torch {torch.__version__}, {name}, batch {BATCH}; goal: wait under {GOAL:.0%} of the step")
     for title, case in list(CASES.items())[: 1 if options.quick else None]:
         with tempfile.TemporaryDirectory() as folder, ExitStack() as around:
-            dataset, proxy = legs(case, Path(folder), options, around)
+            dataset, proxy = placed(case, Path(folder), options, around)
             show(title, measure(case, dataset, device, options))
             if proxy:
                 show_requests(dataset, proxy)
@@ -175,23 +175,26 @@ def bank_of(way: str, dataset: Dataset, device: torch.device) -> VertexBank:
     return open_bank(dataset, identities, cache="device" if way == "device" else "stream", **placed)  # type: ignore[arg-type]
 
 
-def legs(case: Case, folder: Path, options: argparse.Namespace, around: ExitStack) -> tuple[Dataset, Proxy | None]:
-    """Legs of 8 identities, all for training, in a folder, or on a server behind a proxy while ``around`` is open."""
-    recipe = DatasetRecipe.model_validate(
-        {
-            "body": {"family": "leg", "rings": case.rings, "segments": case.segments},
-            "identities": {"training": 8, "evaluation": 0},
-            "poses": {"seen": options.poses, "unseen": 0},
-            "triples": {"count": 0},
-            "store": {"poses_per_shard": -(-options.poses // _COLUMNS)},
-        }
-    )
+def placed(case: Case, folder: Path, options: argparse.Namespace, around: ExitStack) -> tuple[Dataset, Proxy | None]:
+    """Legs in a folder, or on a server behind a proxy while ``around`` is open."""
     if options.s3 is None:
-        return open_dataset(generate(recipe, str(folder / "legs.zarr")).url), None
+        return legs(case, str(folder / "legs.zarr"), poses=options.poses), None
     around.enter_context(s3_server())
-    url = generate(recipe, f"{BUCKET}/legs.zarr").url
+    url = legs(case, f"{BUCKET}/legs.zarr", poses=options.poses).url
     proxy = around.enter_context(proxied(folder / "requests", delay=options.s3 / 1e3))
     return open_dataset(url), proxy
+
+
+def legs(case: Case, url: str, *, poses: int) -> Dataset:
+    """Legs of 8 identities, all for training."""
+    sizes = {
+        "body": {"family": "leg", "rings": case.rings, "segments": case.segments},
+        "identities": {"training": 8, "evaluation": 0},
+        "poses": {"seen": poses, "unseen": 0},
+        "triples": {"count": 0},
+        "store": {"poses_per_shard": -(-poses // _COLUMNS)},
+    }
+    return generate(DatasetRecipe.model_validate(sizes), url)
 
 
 if __name__ == "__main__":

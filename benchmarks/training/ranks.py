@@ -55,7 +55,7 @@ def compared(case: Case, folder: Path, steps: int, number: int) -> float:
     """One training of each way; the rate of two ranks over that of one process."""
     data = folder / "legs.zarr"
     if not data.exists():
-        legs(case, folder, poses=100)
+        legs(case, str(data), poses=100)
     recipe = recipe_of(case, steps)
     rates = [
         rate(recipe, data, folder / f"run-{number}-{ranks}", ranks=ranks, threads=threads)
