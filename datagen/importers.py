@@ -44,7 +44,7 @@ def found_recipe(layout: Layout, path: str | Path, **options: Any) -> DatasetRec
     meshes = find_meshes(body)
     if layout == "multigarment":
         counts = (0, len(meshes.identities), 1, 0)
-    elif _has_all(meshes):
+    elif all((identity, pose) in meshes.files for identity in meshes.identities for pose in meshes.poses):
         counts = _counts(meshes)
     else:
         ordered, counts = _ragged(meshes)
@@ -58,10 +58,6 @@ def found_recipe(layout: Layout, path: str | Path, **options: Any) -> DatasetRec
             "poses": {"seen": seen, "unseen": unseen, "distribution": {"name": "found"}},
         }
     )
-
-
-def _has_all(meshes: FoundMeshes) -> bool:
-    return all((identity, pose) in meshes.files for identity in meshes.identities for pose in meshes.poses)
 
 
 def _counts(meshes: FoundMeshes) -> Counts:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.common.assets import git
-from datagen.generate.identities import Identities, describe_identities, joined, stored_identities
+from datagen.generate.identities import describe_identities, joined, stored_identities
 from datagen.generate.runners import Progress, Runner, Task, inline, unseen
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
@@ -91,8 +91,9 @@ def plan_of(
     people = joined([stored_identities(before), *described] if before else described)
     drawn = work.blocks(draw_rotations, range(there[1], grid.pose_count), SECONDS_POSE, unit="pose")
     rotations = [each.rotations for each in sorted(drawn, key=attrgetter("first"))]
+    labelled = {"labelled": list(people.labels)} if people.labels else {}
     return Plan(
-        attributes={**head.attributes, "rigs": people.parts, **_labelled(people)},
+        attributes={**head.attributes, "rigs": people.parts, **labelled},
         provenance=head.provenance,
         arrays=people.arrays(grid),
         parameters=people.parameters,
@@ -135,10 +136,6 @@ class _Work:
         if len(blocks) < 2:
             return results
         return self.progress(((len(result), result) for result in results), unit=unit, total=len(numbers), done=0)
-
-
-def _labelled(people: Identities) -> dict[str, list[int]]:
-    return {"labelled": list(people.labels)} if people.labels else {}
 
 
 def prepare(

@@ -63,11 +63,6 @@ def put_group(group: zarr.Group, path: str, attributes: dict[str, Any] | None = 
     put_json(group, f"{path}/zarr.json", {"attributes": attributes or {}, "zarr_format": 3, "node_type": "group"})
 
 
-def put_vertices_metadata(group: zarr.Group, array: GridArray, codec: ShardCodec) -> None:
-    """Store the metadata of an array of vertices: NaN fill, one mesh a chunk, Blosc with shuffle, crc32c."""
-    put_json(group, f"{array.path}/vertices/zarr.json", vertices_metadata(array, codec))
-
-
 def read_array(group: zarr.Group, path: str, dtype: str, shape: Shape) -> NDArray[Any]:
     """Return a small array.
 
@@ -137,7 +132,7 @@ def read_json(group: zarr.Group, path: str) -> dict[str, Any]:
 
 
 def vertices_metadata(array: GridArray, codec: ShardCodec) -> dict[str, Any]:
-    """The metadata of an array of vertices."""
+    """The metadata of an array of vertices: NaN fill, one mesh a chunk, Blosc with shuffle, crc32c."""
     blosc = {"typesize": 4, "cname": codec.compressor, "clevel": codec.level, "shuffle": "shuffle", "blocksize": 0}
     mesh = [codec.vertices, 3]
     sharding = {

@@ -20,7 +20,7 @@ from datagen.grid import SPLITS, GridArrays, Place, Shard, shard_path
 from datagen.mesh.geometry import Bounds
 from datagen.store.arrays import put_array, put_group, read_array, read_json
 from datagen.store.object_names import is_member, require_member
-from datagen.store.objects import delete_object, list_objects, read_bytes, write_bytes
+from datagen.store.objects import list_objects, read_bytes, write_bytes
 from datagen.store.schema import MOST_SHARDS, attributes_of
 
 SEAL = "attributes_sha256"
@@ -35,7 +35,8 @@ _COLUMNS = {
 _MOST = 10**9
 """Of a number in a path."""
 _OBJECTS = "manifest/object_sha256"
-_SO_FAR = "manifest/so_far"
+SO_FAR = "manifest/so_far"
+"""The object that lists the shards of a dataset in the making; the manifest has it all."""
 _SO_FAR_ROW = np.dtype(
     [("sound", "u1"), *((name, np.dtype(it).newbyteorder("<"), of) for name, (it, of, _) in _COLUMNS.items())]
 )
@@ -163,7 +164,7 @@ def put_so_far(group: zarr.Group, so_far: SoFar) -> None:
     for name, values in manifest_of(ordered, {}).columns.items():
         table[name] = values
     content = table.tobytes()
-    write_bytes(group, _SO_FAR, hashlib.sha256(content).digest() + content)
+    write_bytes(group, SO_FAR, hashlib.sha256(content).digest() + content)
 
 
 def read_so_far(group: zarr.Group) -> SoFar | None:
@@ -175,13 +176,13 @@ def read_so_far(group: zarr.Group) -> SoFar | None:
         It is damaged.
     """
     try:
-        content = read_bytes(group, _SO_FAR)
+        content = read_bytes(group, SO_FAR)
     except (OSError, UnsafeFileError) as error:
-        raise ValueError(_SO_FAR) from error
+        raise ValueError(SO_FAR) from error
     if content is None:
         return None
     if hashlib.sha256(content[32:]).digest() != content[:32]:
-        raise ValueError(_SO_FAR)
+        raise ValueError(SO_FAR)
     table = np.frombuffer(content[32:], _SO_FAR_ROW)
     _require_places(table["place"])
     rows = Manifest({name: table[name] for name in _COLUMNS}, {}).shards
@@ -189,11 +190,6 @@ def read_so_far(group: zarr.Group) -> SoFar | None:
     for row, sound in zip(rows, table["sound"], strict=True):
         both[not sound].append(row)
     return SoFar(*both)
-
-
-def delete_so_far(group: zarr.Group) -> None:
-    """Remove it, as the manifest has it all."""
-    delete_object(group, _SO_FAR)
 
 
 def commit(
@@ -276,7 +272,8 @@ def covers(manifest: Manifest, arrays: GridArrays) -> bool:
 def is_sealed(group: zarr.Group) -> bool:
     """Whether the root's attributes are as :func:`commit` left them."""
     attributes = attributes_of(group)
-    return attributes.get(SEAL) == _digest(_without_seal(attributes))
+    seal = attributes.pop(SEAL, None)
+    return seal == _digest(attributes)
 
 
 def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str, str]]:
@@ -296,10 +293,6 @@ def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str
 def _small_objects(group: zarr.Group) -> list[str]:
     paths = (path for path in list_objects(group) if is_member(path) and "/vertices/c/" not in path)
     return [path for path in paths if path != "zarr.json" and not path.startswith("manifest/")]
-
-
-def _without_seal(attributes: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in attributes.items() if key != SEAL}
 
 
 def _digest(content: Any) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from typing import Any
@@ -43,6 +43,11 @@ class Dataset:
 
     url: str
     group: zarr.Group
+    _codecs: dict[str, ShardCodec] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _topologies: dict[int, NDArray[np.int32]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _parameters: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _rigs: dict[int, Rigs] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _indexes: dict[str, NDArray[np.uint64]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
@@ -198,26 +203,6 @@ class Dataset:
             with self._damage():
                 if not np.array_equal(read_array(self.group, path, "int32", numbers.shape), numbers):
                     raise ArrayDamage(f"{path}/c/0", "other numbers than the grid's")
-
-    @cached_property
-    def _codecs(self) -> dict[str, ShardCodec]:
-        return {}
-
-    @cached_property
-    def _topologies(self) -> dict[int, NDArray[np.int32]]:
-        return {}
-
-    @cached_property
-    def _parameters(self) -> dict[str, NDArray[np.float64]]:
-        return {}
-
-    @cached_property
-    def _rigs(self) -> dict[int, Rigs]:
-        return {}
-
-    @cached_property
-    def _indexes(self) -> dict[str, NDArray[np.uint64]]:
-        return {}
 
     def vertices(self, identity: int, poses: int | Sequence[int] | NDArray[np.integer] | None = None) -> Meshes:
         """Vertices [pose, vertex, 3] float32 in metres of an identity in some poses; [vertex, 3] for one number.

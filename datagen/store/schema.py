@@ -197,14 +197,15 @@ def open_group(url: str, *, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     """
     try:
         store = open_objects(url, read_only=mode == "r")
-        group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
-        attributes_of(group)
-        return group
+        return _group_of(store, mode)
     except DsffnetError:
         raise
     except FileNotFoundError as error:
         if store.sizes(["zarr.json"]):  # neither a group nor an array; or another process has just begun a dataset
-            return _begun_since(url, store, mode)
+            try:
+                return _group_of(store, mode)
+            except Exception as again:
+                raise _unreadable(url, again) from again
         raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
@@ -212,13 +213,10 @@ def open_group(url: str, *, mode: Literal["r", "r+"] = "r") -> zarr.Group:
         raise _unreadable(url, error) from error
 
 
-def _begun_since(url: str, store: Objects, mode: Literal["r", "r+"]) -> zarr.Group:
-    try:
-        group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
-        attributes_of(group)
-        return group
-    except Exception as error:
-        raise _unreadable(url, error) from error
+def _group_of(store: Objects, mode: Literal["r", "r+"]) -> zarr.Group:
+    group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
+    attributes_of(group)
+    return group
 
 
 def _unreadable(url: str, error: Exception) -> DatasetError:

@@ -19,15 +19,15 @@ from datagen.mesh.geometry import Bounds
 from datagen.mesh.geometry import bounds as bounds_of
 from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
-from datagen.store.arrays import ArrayDamage, put_array, put_group, put_vertices_metadata, read_json
+from datagen.store.arrays import ArrayDamage, put_array, put_group, put_json, read_json, vertices_metadata
 from datagen.store.attributes import check_same_assets, check_same_recipe, with_history
 from datagen.store.manifest import (
     SEAL,
+    SO_FAR,
     ManifestRow,
     SoFar,
     changed_objects,
     commit,
-    delete_so_far,
     is_sealed,
     put_so_far,
     read_manifest,
@@ -199,7 +199,8 @@ def _put_arrays(group: zarr.Group, plan: Plan) -> None:
     for path, values, dimensions in plan.small_arrays():
         put_array(group, path, values, dimensions)
     for array in plan.arrays.arrays:
-        put_vertices_metadata(group, array, codec_of(plan.recipe, array))
+        document = vertices_metadata(array, codec_of(plan.recipe, array))
+        put_json(group, f"{array.path}/vertices/zarr.json", document)
 
 
 class ShardWriter:
@@ -369,10 +370,8 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
         objects = manifest.objects if manifest else None
         put_so_far(group, SoFar(rows))
         commit(group, rows, {"statistics": statistics, "status": "complete"}, objects=objects)
-        with contextlib.suppress(
-            StorageError
-        ):  # the dataset is complete, and where nothing may be removed it is ignored
-            delete_so_far(group)
+        with contextlib.suppress(StorageError):  # it is complete, and where nothing may be removed this is ignored
+            delete_object(group, SO_FAR)
 
 
 def _writing(url: str) -> contextlib.AbstractContextManager[None]:
