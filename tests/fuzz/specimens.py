@@ -81,15 +81,15 @@ def _make_weights(folder: Path, specimens: Specimens) -> None:
     """Exported weights with their manifest, the same without one, and a state_dict as the authors publish theirs."""
     import torch
 
+    from tests.support.three_networks import to_released
     from training.checkpoints.checkpoint import export_weights, require_checkpoint
     from training.networks.npt import NPT
-    from training.networks.released_weights import to_released_npt
 
     export_weights(require_checkpoint(specimens.folder("run") / "run"), folder / "weights")
     (folder / "weights" / "more").mkdir()
     shutil.copy(folder / "weights" / "weights.safetensors", folder / "weights" / "more" / "alone.safetensors")
     torch.manual_seed(0)
-    torch.save(to_released_npt(NPT(encoder_widths=(8, 16, 32))), folder / "weights" / "npt.pth")
+    torch.save(to_released(NPT(encoder_widths=(8, 16, 32))), folder / "weights" / "npt.pth")
 
 
 def _make_workflow(folder: Path, specimens: Specimens) -> None:

@@ -16,7 +16,7 @@ from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 from training.networks.parts import Parts
-from training.networks.released_weights import released_names
+from training.networks.released_weights import DSFFNET_PARTS, NPT_PARTS, released_name, released_names
 
 FORMS: dict[str, Callable[..., nn.Module]] = {
     "dsffnet": DSFFNet,
@@ -139,3 +139,10 @@ def _loss(network: nn.Module, inputs: dict[str, Tensor]) -> Tensor:
     pose = source.square().mean(dim=1, keepdim=True)
     truth = 0.6 * target + 0.3 * torch.sin(15 * pose + target.flip(2))
     return (network(**inputs) - truth).square().mean()
+
+
+def to_released(network: DSFFNet | NPT) -> dict[str, Tensor]:
+    """The state_dict that the authors' module loads: of convolutions of kernel 1, by their names."""
+    parts = DSFFNET_PARTS if isinstance(network, DSFFNet) else NPT_PARTS
+    own = network.state_dict().items()
+    return {released_name(name, parts): value[..., None] if value.ndim == 2 else value for name, value in own}

@@ -19,15 +19,6 @@ from training.networks.corenet3d import RESIDUAL_BLOCKS, CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 
-__all__ = [
-    "load_released",
-    "load_released_corenet3d",
-    "load_released_dsffnet",
-    "load_released_npt",
-    "to_released_dsffnet",
-    "to_released_npt",
-]
-
 Network = TypeVar("Network", bound=nn.Module)
 Released = str | Path | Mapping[str, Any]
 """A file of ``torch.save``, or what was in it."""
@@ -36,11 +27,11 @@ _SHARED = {
     "layers": "", "0": "conv1", "1": "conv2", "2": "conv3",
     "lift": "conv1", "linear1": "conv1", "linear2": "conv2", "linear3": "conv3", "out": "conv4",
 }  # fmt: skip
-_DSFFNET = _SHARED | {f"block{i}": f"testres{i}" for i in (1, 2, 3)} | {
+DSFFNET_PARTS = _SHARED | {f"block{i}": f"testres{i}" for i in (1, 2, 3)} | {
     "norm1": "test1", "norm2": "test2",
     "identity_shift": "conv_id1", "identity_scale": "conv_id2", "mixed_shift": "conv_po1", "mixed_scale": "conv_po2",
 }  # fmt: skip
-_NPT = _SHARED | {f"block{i}": f"spadain_block{i}" for i in (1, 2, 3)} | {
+NPT_PARTS = _SHARED | {f"block{i}": f"spadain_block{i}" for i in (1, 2, 3)} | {
     "norm1": "spadain1", "norm2": "spadain2", "norm_residual": "spadain_res",
     "scale": "conv_weight", "shift": "conv_bias", "linear_residual": "conv_res",
 }  # fmt: skip
@@ -88,7 +79,7 @@ def load_released_dsffnet(released: Released, **options: Any) -> DSFFNet:
     """
     state = read_released(released)
     widths = _widths(state, encoder_widths=_ENCODER, decoder_widths=_DECODER)
-    return filled(DSFFNet(**{**widths, **options}), state, _DSFFNET)
+    return filled(DSFFNet(**{**widths, **options}), state, DSFFNET_PARTS)
 
 
 def load_released_npt(released: Released, *, variant: Literal["maxpool", "origin"]) -> NPT:
@@ -108,17 +99,7 @@ def load_released_npt(released: Released, *, variant: Literal["maxpool", "origin
         Not a checkpoint, or a name is missing, unknown, or of a wrong shape.
     """
     state = read_released(released)
-    return filled(NPT(variant=variant, **_widths(state, encoder_widths=_ENCODER)), state, _NPT)
-
-
-def to_released_dsffnet(network: DSFFNet) -> dict[str, Tensor]:
-    """Return the state_dict that the authors' ``FFAdaINModel`` loads."""
-    return _released_state(network, _DSFFNET)
-
-
-def to_released_npt(network: NPT) -> dict[str, Tensor]:
-    """Return the state_dict that the authors' ``NPT`` of the same variant loads."""
-    return _released_state(network, _NPT)
+    return filled(NPT(variant=variant, **_widths(state, encoder_widths=_ENCODER)), state, NPT_PARTS)
 
 
 def read_released(released: Released) -> dict[str, Tensor]:
@@ -160,7 +141,7 @@ def filled(network: Network, state: Mapping[str, Tensor], parts: Mapping[str, st
 def released_name(name: str, parts: Mapping[str, str]) -> str:
     """Return the released name of one of our parameters.
 
-    >>> released_name("decoder.block2.norm1.mixed_scale.weight", _DSFFNET)
+    >>> released_name("decoder.block2.norm1.mixed_scale.weight", DSFFNET_PARTS)
     'decoder.testres2.test1.conv_po2.weight'
     """
     return ".".join(found for part in name.split(".") if (found := parts.get(part, part)))
@@ -188,13 +169,6 @@ def _widths(state: Mapping[str, Tensor], **layers: tuple[str, ...]) -> dict[str,
         argument: tuple(state[name].shape[0] for name in names)
         for argument, names in layers.items()
         if all(name in state and state[name].ndim and state[name].shape[0] for name in names)
-    }
-
-
-def _released_state(network: nn.Module, parts: Mapping[str, str]) -> dict[str, Tensor]:
-    return {
-        released_name(name, parts): value.reshape(_released_shape(value))
-        for name, value in network.state_dict().items()
     }
 
 

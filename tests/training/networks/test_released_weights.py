@@ -12,14 +12,10 @@ from torch import Tensor, nn
 from torch.nn.functional import conv1d, instance_norm
 
 from datagen.common.errors import DsffnetError
+from tests.support.three_networks import to_released
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
-from training.networks.released_weights import (
-    load_released_dsffnet,
-    load_released_npt,
-    to_released_dsffnet,
-    to_released_npt,
-)
+from training.networks.released_weights import load_released_dsffnet, load_released_npt
 
 ENCODER, DECODER = (8, 12, 20), (10, 24, 14)
 
@@ -93,7 +89,7 @@ def _random(network: nn.Module) -> nn.Module:
 
 
 def _dsffnet_state() -> dict[str, Tensor]:
-    return to_released_dsffnet(_random(DSFFNet(encoder_widths=ENCODER, decoder_widths=DECODER)))
+    return to_released(_random(DSFFNet(encoder_widths=ENCODER, decoder_widths=DECODER)))
 
 
 def _meshes() -> tuple[Tensor, Tensor]:
@@ -119,7 +115,7 @@ def test_dsffnet_with_released_weights_is_the_released_function() -> None:
 
 @pytest.mark.parametrize("variant", ["maxpool", "origin"])
 def test_npt_with_released_weights_is_the_released_function(variant: str) -> None:
-    state = to_released_npt(_random(NPT(variant=variant, encoder_widths=ENCODER)))
+    state = to_released(_random(NPT(variant=variant, encoder_widths=ENCODER)))
     network = load_released_npt(state, variant=variant)
     _same_function(
         network,
@@ -130,7 +126,7 @@ def test_npt_with_released_weights_is_the_released_function(variant: str) -> Non
 
 def test_released_sizes() -> None:
     """Shapes that the authors' modules have (their code, at its only widths)."""
-    dsffnet, npt = to_released_dsffnet(DSFFNet()), to_released_npt(NPT())
+    dsffnet, npt = to_released(DSFFNet()), to_released(NPT())
     assert list(dsffnet["decoder.testres2.test1.conv_po2.weight"].shape) == [1024, 1027, 1]
     assert list(dsffnet["decoder.conv2.weight"].shape) == [1024, 256, 1]
     assert list(dsffnet["decoder.testres3.test2.alpha"].shape) == [1]
@@ -154,7 +150,7 @@ def test_files_of_every_wrapping_are_read(tmp_path: Path, wrapped: Callable, leg
     state = _dsffnet_state()
     path = tmp_path / "model.pth"
     torch.save(wrapped(state), path, _use_new_zipfile_serialization=not legacy)
-    read = to_released_dsffnet(load_released_dsffnet(str(path)))
+    read = to_released(load_released_dsffnet(str(path)))
     assert read.keys() == state.keys()
     for name, value in state.items():
         assert torch.equal(read[name], value.float())
@@ -162,13 +158,13 @@ def test_files_of_every_wrapping_are_read(tmp_path: Path, wrapped: Callable, leg
 
 def test_an_ablation_is_read_with_its_option() -> None:
     network = _random(DSFFNet(encoder_widths=ENCODER, decoder_widths=DECODER, target_side=False))
-    read = load_released_dsffnet(to_released_dsffnet(network), target_side=False)
+    read = load_released_dsffnet(to_released(network), target_side=False)
     assert torch.equal(
         read.decoder.block1.norm1.mixed_scale.weight.double(),
         network.decoder.block1.norm1.mixed_scale.weight.float().double(),
     )
     with pytest.raises(DsffnetError, match=r"missing: decoder\.testres1\.test1\.alpha"):
-        load_released_dsffnet(to_released_dsffnet(network))
+        load_released_dsffnet(to_released(network))
 
 
 def test_faults_are_named_all_at_once() -> None:

@@ -16,10 +16,10 @@ from tests.support.commands import ROOT, command, fails, process
 from tests.support.disk import grow, small_disk
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import tiny_training
+from tests.support.three_networks import to_released
 from training.engine.trainer import train
 from training.inference.predict import load_trained
 from training.networks.npt import NPT
-from training.networks.released_weights import to_released_npt
 from workflows.pipeline.run_folder import SingleRunFolder
 
 
@@ -157,7 +157,7 @@ def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Pa
 def test_published_weights_become_ours(trained: tuple[Path, Path], tmp_path: Path) -> None:
     dataset, source = open_dataset(str(trained[0])), NPT(variant="maxpool")
     save_mesh(Mesh(dataset.vertices(3, 7), dataset.faces(3)), tmp_path / "a.obj")
-    torch.save(to_released_npt(source), tmp_path / "npt.model")
+    torch.save(to_released(source), tmp_path / "npt.model")
     done = command("import-weights", "npt", tmp_path / "npt.model", "--out", tmp_path / "ours")
     assert done.returncode == 0, done.stderr
     loaded = load_trained(tmp_path / "ours")[0].state_dict()
