@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from safetensors.torch import save
-from torch import Tensor, nn
+from torch import nn
 
 from training.data.batch import Batch
 from training.evaluation.evaluate import Method, require_distinct, require_pairable
@@ -54,15 +54,9 @@ class Inference:
 
 
 def measure_inference(
-    methods: Sequence[Method],
-    *,
-    vertices: int | Batch,
-    repeats: int = 20,
-    warm_up: int = 3,
-    threads: int | None = None,
-    device: torch.device | str = "cpu",
+    methods: Sequence[Method], batch: Batch, *, repeats: int = 20, warm_up: int = 3, threads: int = 1
 ) -> dict[str, Inference]:
-    """Time one pair through each network in this process, the networks taking turns round by round.
+    """Time one pair through each network in this process and on its CPU, the networks taking turns round by round.
 
     Taking turns spreads whatever else the machine does over all of them; which comes first moves on with every round.
     The call is the one that an evaluation makes (:func:`training.inference.predict.predict`), in float32.
@@ -71,15 +65,12 @@ def measure_inference(
     ----------
     methods
         Networks by name and weights; all are held in memory at once.
-    vertices
-        Vertices of both meshes, which are then random points (no network does more work for one mesh than for another
-        of its size), or a batch whose first pair is taken.
+    batch
+        Whose first pair is taken, without its padding.
     repeats, warm_up
         Rounds that count, and those before them that do not.
     threads
-        CPU threads of torch while measuring; None: as many as it has.
-    device
-        Where to run.
+        CPU threads of torch while measuring.
 
     Raises
     ------
@@ -87,16 +78,12 @@ def measure_inference(
         A network cannot take the pair, or two have one name.
     CheckpointError
         Weights are missing or damaged.
-    ValueError
-        ``repeats`` or ``vertices`` is less than one.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats must be positive, got {repeats}")
     require_distinct([method.name for method in methods])
-    pair = _random_pair(vertices) if isinstance(vertices, int) else _first_pair(vertices)
-    networks = {method.name: _loaded(method, pair).to(device) for method in methods}
-    with _threads(threads) as used:
-        seconds = _interleaved(networks, pair.to(device), repeats=repeats, warm_up=warm_up)
+    pair = _first_pair(batch)
+    networks = {method.name: _loaded(method, pair) for method in methods}
+    with _threads(threads):
+        seconds = _interleaved(networks, pair, repeats=repeats, warm_up=warm_up)
     return {
         name: Inference(
             parameters=sum(weight.numel() for weight in network.parameters()),
@@ -107,8 +94,8 @@ def measure_inference(
             source_vertices=pair.source.shape[1],
             target_vertices=pair.target.shape[1],
             rounds=repeats,
-            threads=used,
-            device=_device_name(torch.device(device)),
+            threads=threads,
+            device="cpu",
             mean=statistics.fmean(seconds[name]),
         )
         for name, network in networks.items()
@@ -122,29 +109,13 @@ def _loaded(method: Method, pair: Batch) -> nn.Module:
     return network
 
 
-def _random_pair(vertices: int) -> Batch:
-    if vertices < 1:
-        raise ValueError(f"vertices must be positive, got {vertices}")
-    draw = torch.Generator().manual_seed(0)
-    source, target = (torch.rand(1, vertices, 3, generator=draw) * 2 - 1 for _ in range(2))
-    return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64))
-
-
 def _first_pair(batch: Batch) -> Batch:
-    """The first pair of a batch, without padding."""
     pair = batch.part(0, 1)
-    source, target = (_unpadded(mesh, counts) for mesh, counts in _meshes(pair))
+    meshes = (pair.source, pair.source_counts), (pair.target, pair.target_counts)
+    source, target = (mesh[:, : counts[0]] if counts else mesh for mesh, counts in meshes)
     told = pair.surfaces
     surfaces = told and (told[0].of(slice(1), source.shape[1]), told[1].of(slice(1), target.shape[1]))
     return Batch(source, target, target, torch.zeros(0, 2, dtype=torch.int64), surfaces=surfaces)
-
-
-def _meshes(pair: Batch) -> list[tuple[Tensor, tuple[int, ...] | None]]:
-    return [(pair.source, pair.source_counts), (pair.target, pair.target_counts)]
-
-
-def _unpadded(mesh: Tensor, counts: tuple[int, ...] | None) -> Tensor:
-    return mesh[:, : counts[0]] if counts else mesh
 
 
 def _interleaved(networks: dict[str, nn.Module], pair: Batch, *, repeats: int, warm_up: int) -> dict[str, list[float]]:
@@ -152,32 +123,20 @@ def _interleaved(networks: dict[str, nn.Module], pair: Batch, *, repeats: int, w
     order = list(networks)
     for turn in range(-warm_up, repeats):
         for name in order:
-            taken = _seconds(networks[name], pair)
+            before = time.perf_counter()
+            predict(networks[name], pair)
             if turn >= 0:
-                seconds[name].append(taken)
+                seconds[name].append(time.perf_counter() - before)
         order = [*order[1:], *order[:1]]
     return seconds
 
 
-def _seconds(network: nn.Module, pair: Batch) -> float:
-    _wait(pair.source.device)
-    before = time.perf_counter()
-    predict(network, pair)
-    _wait(pair.source.device)
-    return time.perf_counter() - before
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 @contextmanager
-def _threads(wanted: int | None) -> Iterator[int]:
+def _threads(wanted: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(wanted or before)
+    torch.set_num_threads(wanted)
     try:
-        yield torch.get_num_threads()
+        yield
     finally:
         torch.set_num_threads(before)
 
@@ -189,7 +148,3 @@ def _kilobytes(network: nn.Module) -> float:
         for name, value in network.state_dict().items()
     }
     return len(save(weights)) / _KIBIBYTE
-
-
-def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)

@@ -13,6 +13,7 @@ from datagen.generate import ray_runner
 from datagen.store import Dataset
 from training.checkpoints.checkpoint import require_checkpoint
 from training.data.batch import Batch, read_batch
+from training.evaluation.document import Text, document_markdown, plain
 from training.evaluation.evaluate import (
     POSE_TYPES,
     Method,
@@ -33,7 +34,7 @@ from workflows.pipeline.progress import sampling
 from workflows.pipeline.run_folder import ComparisonFolder, EvaluationFolder
 from workflows.pipeline.stage import recorded
 from workflows.studies.comparison.plan import ComparisonPlan
-from workflows.studies.comparison.tables import as_markdown, tables_of
+from workflows.studies.comparison.tables import tables_of
 
 FOLDER = "evaluation"
 
@@ -76,10 +77,11 @@ def evaluate_methods(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, 
         methods = [Method(name, str(require_checkpoint(run, "result").path)) for name, run in runs.items()]
         rows = evaluate(methods, dataset.url, recipe, tasks=ray_runner, keep=folder.chunks, progress=evaluation_bar)
         write_rows(rows, folder.rows)
-        inference = measure_inference(methods, vertices=_first_pair(dataset, recipe), threads=1)
+        inference = measure_inference(methods, _first_pair(dataset, recipe))
         values = {name: asdict(measured) for name, measured in inference.items()}
         write_atomically(folder.inference, json.dumps(values, indent=1).encode())
-        text = as_markdown(plan, tables_of(plan, dataset, runs, rows, inference), plan.description)
+        tables = tables_of(plan, dataset, runs, rows, inference)
+        text = document_markdown(plan.title, [Text(plain(plan.description)), *tables])
         write_atomically(folder.tables, text.encode())
         _draw(plan, dataset, runs, rows, folder)
         artifacts = ["rows.csv", "tables.md", "viewer.html", "inference.json", "figures", "meshes"]

@@ -47,9 +47,10 @@ def run_comparison(
 
     def finish(outcomes: list[Outcome], begin: Callable[[], None]) -> None:
         judge(outcomes, of=len(plan.methods), strict=True)
+        trainings = {name: trial.training.model_dump(mode="json") for name, trial in plan.methods.items()}
         evaluate = Stage(
             "evaluate",
-            depends_on=[_trainings(plan), weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
+            depends_on=[trainings, weights_of(runs), plan.recipe.evaluation.model_dump(mode="json")],
             intact=lambda: intact(folder.evaluation) and has_record(folder.evaluation.path),
             work=lambda: _evaluate(plan, folder, runs),
         )
@@ -60,10 +61,6 @@ def run_comparison(
     settings = Settings(plan.title, cpus=cpus, gpus=gpus)
     work = Work(plan.sweep, folder, settings, {"methods": ", ".join(plan.methods)}, partial(_tags, plan))
     run_trials(work, runner=ray_trials, finish=finish)
-
-
-def _trainings(plan: ComparisonPlan) -> dict[str, object]:
-    return {name: trial.training.model_dump(mode="json") for name, trial in plan.methods.items()}
 
 
 def _tags(plan: ComparisonPlan, trial: Trial) -> dict[str, str]:

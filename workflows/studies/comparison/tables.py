@@ -6,7 +6,7 @@ from pathlib import Path
 
 from datagen.store import Dataset
 from training.data.triples import last_step_of
-from training.evaluation.document import Table, Text, document_markdown, plain
+from training.evaluation.document import Table
 from training.evaluation.evaluate import Row
 from training.evaluation.paper_numbers import PaperData
 from training.evaluation.run_curves import PMD_UNIT, run_curve
@@ -34,11 +34,6 @@ def tables_of(
         first = [table_1(rows, data=data, here=here, emd_points=points), table_2(inference)]
     every = replace(summary(rows), caption="Every metric", notes=DEFINITIONS.format(points=points))
     return [*first, Table(_costs(plan, dataset, runs), "What training cost", _COSTS), every]
-
-
-def as_markdown(plan: ComparisonPlan, tables: list[Table], about: str) -> str:
-    """The tables as one Markdown document."""
-    return document_markdown(plan.title, [Text(plain(about)), *tables])
 
 
 def _costs(plan: ComparisonPlan, dataset: Dataset, runs: Mapping[str, Path]) -> list[list[str]]:
