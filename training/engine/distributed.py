@@ -203,20 +203,33 @@ def forget_old_stop(run: Path, ranks: Ranks, *, before: float) -> None:
     decided_by_first(ranks, remove)
 
 
+@contextlib.contextmanager
+def on_sigterm(told: Callable[[], object]) -> Iterator[None]:
+    """Call ``told`` at SIGTERM while the block runs; in a thread, which cannot handle signals, change nothing."""
+    try:
+        before = signal.signal(signal.SIGTERM, lambda *_: told())
+    except ValueError:  # not the main thread; Ray Train runs ranks in one
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 class StopRequest:
     """Whether this training was told to stop: by SIGTERM to this process, or by the file RUN/stop (for Ray's ranks)."""
 
     def __init__(self, run: Path) -> None:
         self._file, self._signalled, self._looked = run / STOP_FILE, threading.Event(), 0.0
+        self._heeding = on_sigterm(self._signalled.set)
 
     def __enter__(self) -> "StopRequest":
-        with contextlib.suppress(ValueError):  # Ray Train runs ranks in a thread, which may not handle signals
-            self._before = signal.signal(signal.SIGTERM, lambda *_: self._signalled.set())
+        self._heeding.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if hasattr(self, "_before"):
-            signal.signal(signal.SIGTERM, self._before)
+    def __exit__(self, *reason: Any) -> None:
+        self._heeding.__exit__(*reason)
 
     def made(self) -> bool:
         """Whether to stop after this step; looks for the file once a second."""

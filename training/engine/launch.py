@@ -8,12 +8,10 @@ import json
 import logging
 import os
 import re
-import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +22,7 @@ from typing_extensions import TypedDict
 from datagen.common.errors import DsffnetError, TrainingError, TrainingStopped, reason_of
 from datagen.common.files import read_json_if_whole, read_within, set_aside, write_atomically
 from datagen.common.printable import printable
-from training.engine.distributed import STOP_FILE, Ranks, device_of, is_of_the_group
+from training.engine.distributed import STOP_FILE, Ranks, device_of, is_of_the_group, on_sigterm
 from training.engine.trainer import train
 from training.recipes.files import recipe_in
 from training.recipes.training import TrainingRecipe
@@ -76,7 +74,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     write_atomically(run / _MARK, mark.encode())
     told = {"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark, "began": began}
     try:
-        with _passing_on_sigterm(run):
+        with on_sigterm((run / STOP_FILE).touch):  # the ranks finish their step, write a checkpoint and end
             fit_while_progressing(_group(recipe, told, gpu=gpu).fit, run)
     except DsffnetError:
         raise
@@ -86,6 +84,8 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
             f"{_last_line(error)}. "
             "Run the same command again to resume from the newest checkpoint"
         ) from error
+    finally:
+        (run / STOP_FILE).unlink(missing_ok=True)
     failure = failure_of(run)
     if failure:
         raise failure
@@ -187,21 +187,6 @@ class _Left(TypedDict):
 
 
 _LEFT = TypeAdapter(_Left)
-
-
-@contextmanager
-def _passing_on_sigterm(run: Path) -> Iterator[None]:
-    """While the block runs, SIGTERM to this process asks the ranks to finish their step, checkpoint and end."""
-    try:
-        before = signal.signal(signal.SIGTERM, lambda *_: (run / STOP_FILE).touch())
-    except ValueError:  # not the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        (run / STOP_FILE).unlink(missing_ok=True)
 
 
 def on_gpus(

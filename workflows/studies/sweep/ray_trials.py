@@ -5,11 +5,10 @@ checkpoint, so that nothing is done twice. What stops or fails a trial ends that
 """
 
 import contextlib
-import signal
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from typing import Any, Literal
 from datagen.common.errors import ClusterError, DsffnetError, TrainingError, TrainingStopped, WorkflowError
 from datagen.common.files import read_within, write_atomically
 from datagen.store import open_dataset
+from training.engine.distributed import on_sigterm
 from training.tracking.record import end_record, read_record, update_record
 from workflows.pipeline.run_folder import RunFolder, TrialsFolder
 from workflows.pipeline.stage import recorded, say
@@ -126,8 +126,9 @@ def ray_trials(
     placed = [_on_device(trial, gpus) for trial in trials]  # before any is submitted: one that cannot be starts none
     task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_RETRIES)(train_trial)
     running = {task.remote(trial, place, tags=tags(trial), threads=cpus): trial for trial in placed}
+    told = threading.Event()
     try:
-        with _heeding_sigterm() as told:
+        with on_sigterm(told.set):
             while running:
                 done, _ = ray.wait(list(running), timeout=1.0)
                 for reference in done:
@@ -173,21 +174,6 @@ def _require_shared_disk(place: Place) -> None:
     mark = TrialsFolder(place.out).mark
     if not mark.exists() or read_within(place.out, mark.name) != place.mark.encode():
         raise WorkflowError(f"this trial does not see {place.out} as the driver does: --out must be on a shared disk")
-
-
-@contextlib.contextmanager
-def _heeding_sigterm() -> Iterator[threading.Event]:
-    """Note SIGTERM while the block runs, so that trials are told before this process ends."""
-    told = threading.Event()
-    try:
-        before = signal.signal(signal.SIGTERM, lambda *_: told.set())
-    except ValueError:  # not the main thread
-        yield told
-        return
-    try:
-        yield told
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _require_room(cpus: int, gpus: float) -> None:
