@@ -1,15 +1,12 @@
 """The load of this machine, under the names that MLflow gives to system metrics, so that its UI shows them as such."""
 
 import contextlib
-import importlib
 import logging
-import shutil
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import psutil
 
@@ -30,11 +27,11 @@ def sampling(path: Path, *, every: float = 5.0) -> Iterator[None]:
 
 
 class MachineLoad:
-    """Reads CPU, memory, disk, network and, where there is an NVIDIA driver, each GPU."""
+    """Reads CPU, memory, disk, network and, where there is nvidia-smi, each GPU."""
 
     def __init__(self, place: Path) -> None:
         """``place``: a folder on the disk whose use is told."""
-        self._place, self._gpus = place, gpu_reader()
+        self._place = place
         self._disk, self._network = psutil.disk_io_counters(), psutil.net_io_counters()
         psutil.cpu_percent()  # the first call only begins the interval
 
@@ -54,41 +51,22 @@ class MachineLoad:
         if network and self._network:
             found["network_receive_megabytes"] = (network.bytes_recv - self._network.bytes_recv) / 1e6
             found["network_transmit_megabytes"] = (network.bytes_sent - self._network.bytes_sent) / 1e6
-        return {f"system/{name}": float(value) for name, value in (found | self._gpus()).items()}
+        return {f"system/{name}": float(value) for name, value in (found | gpu_load()).items()}
 
 
-def gpu_reader() -> Callable[[], dict[str, float]]:
-    """What reads use (percent) and memory (megabytes) of each GPU: pynvml, else nvidia-smi, else nothing."""
-    try:
-        nvml = importlib.import_module("pynvml")
-        nvml.nvmlInit()
-        handles = [nvml.nvmlDeviceGetHandleByIndex(index) for index in range(nvml.nvmlDeviceGetCount())]
-    except Exception:  # not installed, or no driver; pynvml has an exception class for each reason
-        return _from_nvidia_smi if shutil.which(_QUERY[0]) else dict
-
-    def read() -> dict[str, float]:
-        return _named([_row(nvml, handle) for handle in handles])
-
-    return read
-
-
-def _row(nvml: Any, handle: Any) -> tuple[float | None, ...]:
-    """Use, memory used and memory in all of one GPU; None for what it does not tell (its parts under MIG, say)."""
-    use = memory = None
-    with contextlib.suppress(nvml.NVMLError):
-        use = nvml.nvmlDeviceGetUtilizationRates(handle).gpu
-    with contextlib.suppress(nvml.NVMLError):
-        memory = nvml.nvmlDeviceGetMemoryInfo(handle)
-    return use, memory and memory.used / 1e6, memory and memory.total / 1e6
-
-
-def _from_nvidia_smi() -> dict[str, float]:
+def gpu_load() -> dict[str, float]:
+    """Use (percent) and memory (megabytes) of each GPU, as nvidia-smi tells them; nothing where there is none."""
     try:
         done = subprocess.run(_QUERY, capture_output=True, encoding="utf-8", errors="replace", timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):
         return {}
     rows = [[_number(value) for value in line.split(",")] for line in done.stdout.splitlines() if line.count(",") == 2]
-    return _named([(use, used and used * _MIB, total and total * _MIB) for use, used, total in rows])
+    found = {}
+    for index, (use, used, total) in enumerate(rows):
+        found[f"gpu_{index}_utilization_percentage"] = use
+        found[f"gpu_{index}_memory_usage_megabytes"] = used and used * _MIB
+        found[f"gpu_{index}_memory_usage_percentage"] = 100 * used / total if used is not None and total else None
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _number(text: str) -> float | None:
@@ -97,15 +75,6 @@ def _number(text: str) -> float | None:
         return float(text)
     except ValueError:
         return None
-
-
-def _named(rows: list[tuple[float | None, ...]]) -> dict[str, float]:
-    found = {}
-    for index, (use, used, total) in enumerate(rows):
-        found[f"gpu_{index}_utilization_percentage"] = use
-        found[f"gpu_{index}_memory_usage_megabytes"] = used
-        found[f"gpu_{index}_memory_usage_percentage"] = 100 * used / total if used is not None and total else None
-    return {name: value for name, value in found.items() if value is not None}
 
 
 def _sample(path: Path, stop: threading.Event, every: float) -> None:
