@@ -26,7 +26,6 @@ from datagen.common.files import read_text_within
 from datagen.recipe import DatasetRecipe
 from training.recipes.training import TrainingRecipe
 from training.reports.report import NAMES, report_is_current, workflow_report
-from training.tracking.mlflow_mirror import Mirror
 from training.tracking.mlflow_store import sqlite_file
 from training.tracking.record import ALIAS, EXPERIMENT, MODEL, Server, has_record, read_record, update_record
 from workflows.cli.declare import (
@@ -38,9 +37,9 @@ from workflows.cli.declare import (
     add_yes_option,
     recipe_keys,
 )
-from workflows.pipeline.console import guarded, print_text, server_of
+from workflows.pipeline.console import at_work, guarded, print_text
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
-from workflows.pipeline.forecast import announce_size, announce_times
+from workflows.pipeline.forecast import announce_times
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.run_folder import RunFolder, SingleRunFolder
@@ -55,14 +54,10 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser(sys.argv[1:] if arguments is None else arguments).parse_args(arguments)
     recipe = load_recipe(options.recipe, options.set)
     out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
-    folder, server = SingleRunFolder(out), server_of(out, options.tracking_uri)
-    announce_size(recipe.data, folder.data, anew=options.fresh, yes=options.yes, local=options.local)
-    with folder.alone():
-        if options.fresh:
-            folder.remove()
-        with Mirror(out, server):
-            run_workflow(recipe, out, TaskRunner(local=options.local))
-            print_text(closing_words(folder, server, beside=recipe.beside is not None))
+    folder = SingleRunFolder(out)
+    with at_work(options, folder, recipe.data, local=options.local) as server:
+        run_workflow(recipe, out, TaskRunner(local=options.local))
+        print_text(closing_words(folder, server, beside=recipe.beside is not None))
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from datagen.common.errors import CheckpointError, TrainingError
+from datagen.common.errors import CheckpointError
 from training.checkpoints.checkpoint import is_finished, load_checkpoint, require_checkpoint
 from training.checkpoints.weights import fill_network
-from training.engine.launch import launch
 from training.engine.resume import require_same_training
 from training.engine.tasks.registry import task_of
 from training.recipes.training import TrainingRecipe
@@ -16,6 +15,7 @@ from workflows.pipeline.progress import following
 from workflows.pipeline.run_folder import RunFolder
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.tasks import TaskRunner
+from workflows.pipeline.train import HEAD, train_to_end
 
 
 def learn(recipe: TrainingRecipe, data: Path, run: RunFolder, *, parent: Path, tasks: TaskRunner, name: str) -> None:
@@ -29,17 +29,12 @@ def learn(recipe: TrainingRecipe, data: Path, run: RunFolder, *, parent: Path, t
     task, parameters = task_of(recipe, str(data)), recipe.model_dump(mode="json")
     steps = recipe.last_step(task.order.steps_per_epoch)
     with run.alone(), recorded(run.path, kind="train", name=name, parent=parent, parameters=parameters):
-        update_record(run.path, artifacts=["recipe.yaml", "provenance.json"])
+        update_record(run.path, artifacts=HEAD)
         write_run_head(run.path, parameters, dataset={"name": data.name, "uuid": task.uuid})
         placed = tasks.training(recipe)
         with following(run.journal, steps=steps, steps_per_epoch=task.order.steps_per_epoch):
-            launch(placed, data=str(data), run=run.path)
-        reached = require_checkpoint(run.path)
-        if not is_finished(reached, steps):
-            raise TrainingError(
-                f"training in {run.path} ended at step {reached.step} of {steps}. Run the same command again to resume"
-            )
-        update_record(run.path, artifacts=["recipe.yaml", "provenance.json", "metrics.jsonl"])
+            train_to_end(placed, str(data), run.path, steps)
+        update_record(run.path, artifacts=[*HEAD, "metrics.jsonl"])
 
 
 def is_learned(recipe: TrainingRecipe, data: Path, run: RunFolder) -> bool:

@@ -88,30 +88,24 @@ def avatar_command(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from datagen.common.files import read_text_within
-    from training.tracking.mlflow_mirror import Mirror
     from workflows.avatar.recipe import load_avatar
     from workflows.avatar.run import run_avatar
-    from workflows.pipeline.console import print_text, server_of
-    from workflows.pipeline.forecast import announce_size
+    from workflows.pipeline.console import at_work, print_text
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import AvatarFolder
     from workflows.pipeline.tasks import TaskRunner
 
     recipe = load_avatar(options.recipe, options.set)
     out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
-    folder, server = AvatarFolder(out), server_of(out, options.tracking_uri)
+    folder = AvatarFolder(out)
     folder.require_kind()
-    announce_size(recipe.data, folder.data, anew=options.fresh, yes=options.yes, local=options.local)
-    with folder.alone():
-        if options.fresh:
-            folder.remove()
-        with Mirror(out, server):
-            run_avatar(recipe, out, TaskRunner(local=options.local))
-        print_text(
-            f"{read_text_within(folder.evaluation.path, 'tables.md')}\n"
-            f"  picture       {folder.evaluation.examples}\n"
-            f"  animate it    dsffnet avatar animate {out} -o walk.glb --picture walk.png"
-        )
+    with at_work(options, folder, recipe.data, local=options.local):
+        run_avatar(recipe, out, TaskRunner(local=options.local))
+    print_text(
+        f"{read_text_within(folder.evaluation.path, 'tables.md')}\n"
+        f"  picture       {folder.evaluation.examples}\n"
+        f"  animate it    dsffnet avatar animate {out} -o walk.glb --picture walk.png"
+    )
 
 
 def _evaluate(options: argparse.Namespace) -> None:

@@ -245,9 +245,10 @@ def import_command(options: argparse.Namespace) -> None:
 
 def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
     """What ``--set data.body.*`` says: it decides which files are found."""
-    from workflows.recipe.loader import override_values, with_absolute_paths
+    from datagen.recipe.text import changed, parse_words
+    from workflows.recipe.loader import with_absolute_paths
 
-    section: Any = override_values(overrides)
+    section: Any = changed({}, parse_words(overrides, option="--set "))
     for name in ("data", "body"):
         section = section.get(name, {})
         if not isinstance(section, dict):

@@ -5,6 +5,7 @@ import os
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -21,7 +22,7 @@ from workflows.cli.declare import (
     add_tracking_option,
     add_yes_option,
 )
-from workflows.pipeline.console import print_text, server_of
+from workflows.pipeline.console import at_work, print_text
 
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
@@ -47,22 +48,14 @@ def _trials_options(made: Parser, one: str) -> None:
 
 @contextmanager
 def _at_work(options: argparse.Namespace, folder: "TrialsFolder", data: "DatasetRecipe") -> Iterator[Server]:
-    """Hold a folder of trials, started over where that is asked, and mirror it to MLflow while the block runs."""
-    from training.tracking.mlflow_mirror import Mirror
-    from workflows.pipeline.forecast import announce_size
-
+    """Hold a folder of trials; see :func:`workflows.pipeline.console.at_work`."""
     if options.cpus_per_trial < 1 or options.gpus_per_trial < 0:
         raise RecipeError(
             f"--cpus-per-trial {options.cpus_per_trial} and --gpus-per-trial {options.gpus_per_trial:g}: a training "
             "needs one CPU or more, and no less than no GPU"
         )
-    announce_size(data, folder.data, anew=options.fresh, yes=options.yes)
-    server = server_of(folder.path, options.tracking_uri)
-    with folder.alone():
-        if options.fresh:
-            folder.remove()
-        with Mirror(folder.path, server):
-            yield server
+    with at_work(options, folder, data) as server:
+        yield server
 
 
 def _where(out: Path, server: Server, places: dict[str, str]) -> list[str]:
@@ -74,14 +67,6 @@ def _where(out: Path, server: Server, places: dict[str, str]) -> list[str]:
 
 def _shown(out: Path) -> Path:
     return Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
-
-
-def _compare_options(made: Parser) -> None:
-    _comparison_options(made, "comparison")
-
-
-def _ablation_options(made: Parser) -> None:
-    _comparison_options(made, "ablation")
 
 
 def _comparison_options(made: Parser, kind: ComparisonKind) -> None:
@@ -240,9 +225,10 @@ def robustness_command(options: argparse.Namespace) -> None:
       dsffnet robustness runs/dsffnet runs/npt runs/corenet3d --data X.zarr --out runs/robustness
       dsffnet robustness RUN --data X.zarr --only noise patch --triples 100
     """
-    from workflows.studies.robustness import robustness_command as run
+    from workflows.studies.common import run_study
+    from workflows.studies.robustness import RobustnessStudy
 
-    run(options)
+    run_study(RobustnessStudy(options))
 
 
 def _generalisation_options(made: Parser) -> None:
@@ -279,15 +265,16 @@ def generalisation_command(options: argparse.Namespace) -> None:
       dsffnet generalisation runs/dsffnet runs/npt --out runs/generalisation --topologies notoes_collapse3pc anny
       dsffnet generalisation RUN --data data/faust.zarr data/multigarment.zarr
     """
-    from workflows.studies.generalisation import generalisation_command as run
+    from workflows.studies.common import run_study
+    from workflows.studies.generalisation import GeneralisationStudy
 
-    run(options)
+    run_study(GeneralisationStudy(options))
 
 
 COMMANDS = (
     Command(sweep_command, _sweep_options, takes_recipe=True),
-    Command(compare_command, _compare_options, takes_recipe=True),
-    Command(ablation_command, _ablation_options, takes_recipe=True),
+    Command(compare_command, partial(_comparison_options, kind="comparison"), takes_recipe=True),
+    Command(ablation_command, partial(_comparison_options, kind="ablation"), takes_recipe=True),
     Command(robustness_command, _robustness_options),
     Command(generalisation_command, _generalisation_options),
 )

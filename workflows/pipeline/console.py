@@ -1,13 +1,15 @@
 """How the commands report: text, errors in one line with an exit status; and the MLflow server they mirror to."""
 
+import argparse
 import io
 import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from datagen.common.errors import DsffnetError, RecipeError, reason_of
 from datagen.common.printable import printable, printable_lines
@@ -15,6 +17,10 @@ from datagen.common.resources import ran_out_of_memory
 from training.tracking.mlflow_store import sqlite_file, sqlite_server
 from training.tracking.record import Server, read_record
 from workflows.pipeline.ray_cluster import require_reachable
+
+if TYPE_CHECKING:
+    from datagen.recipe import DatasetRecipe
+    from workflows.pipeline.run_folder import WorkflowFolder
 
 log = logging.getLogger(__name__)
 _LESS = "lower counts, vertices, training.batch or widths"
@@ -115,6 +121,26 @@ def server_of_record(root: Path, uri: str | None) -> Server:
     record = read_record(root)
     is_workflow = record is not None and record.kind in ("workflow", "sweep", "comparison", "ablation")
     return server_of(root if is_workflow else root.parent, uri)
+
+
+@contextmanager
+def at_work(
+    options: argparse.Namespace, folder: "WorkflowFolder", data: "DatasetRecipe", *, local: bool = False
+) -> Iterator[Server]:
+    """Hold a workflow's folder, started over where ``--fresh`` is given, and mirror it to MLflow while the block runs.
+
+    What its data take is said before; ``local``: they are made in this process.
+    """
+    from training.tracking.mlflow_mirror import Mirror
+    from workflows.pipeline.forecast import announce_size
+
+    server = server_of(folder.path, options.tracking_uri)
+    announce_size(data, folder.data, anew=options.fresh, yes=options.yes, local=local)
+    with folder.alone():
+        if options.fresh:
+            folder.remove()
+        with Mirror(folder.path, server):
+            yield server
 
 
 def print_text(text: object) -> None:

@@ -91,20 +91,25 @@ def write_head(recipe: TrainingRecipe, dataset: Dataset, run: Path) -> None:
 
 
 def train_run(recipe: TrainingRecipe, dataset: Dataset, run: RunFolder) -> None:
-    """Train to the last step, and draw the curve.
+    """Train to the last step, and draw the curve; the errors are those of :func:`train_to_end`."""
+    train_to_end(recipe, dataset.url, run.path, last_step_of(recipe, dataset))
+    draw_training_curve(run.path, run.curve, baselines={})
+
+
+def train_to_end(recipe: TrainingRecipe, data: str, run: Path, last: int) -> None:
+    """Train to the ``last`` step.
 
     Raises
     ------
     TrainingError
-        It ended before the last step.
+        It ended before that.
     """
-    launch(recipe, data=dataset.url, run=run.path)
-    reached, last = require_checkpoint(run.path), last_step_of(recipe, dataset)
+    launch(recipe, data=data, run=run)
+    reached = require_checkpoint(run)
     if not is_finished(reached, last):
         raise TrainingError(
-            f"training in {run.path} ended at step {reached.step} of {last}. Run the same command again to resume"
+            f"training in {run} ended at step {reached.step} of {last}. Run the same command again to resume"
         )
-    draw_training_curve(run.path, run.curve, baselines={})
 
 
 def _pmd_at(step: int, run: RunFolder) -> dict[str, float]:
