@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from datagen.characters import cc0_animals
 from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh
-from workflows.demo.bodies import Figure, animals_are_there, mesh_of, random_figure
+from workflows.demo.bodies import Figure, mesh_of, random_figure
 from workflows.demo.poses import ANIMAL, PERSON, Pose
 from workflows.demo.transfers import Asked, Body, Outcome, Switches, Transfers
 
@@ -49,7 +50,7 @@ def cases(folder: Path) -> Iterator[tuple[str, list[Asked]]]:
     own = [(own_mesh(figure, folder / f"{number}.obj"),) for number, figure in enumerate([*sources, bare])]
     yield "own meshes", asked_of(own[:-1], own[-1])
     yield "the same, refined", [replace(each, switches=Switches(refine=True)) for each in asked_of(own[:-1], own[-1])]
-    if animals_are_there():
+    if cc0_animals.are_there():
         animal = random_figure(ANIMAL, random)
         poses = [replace(animal, pose=source.pose) for source in sources]
         yield "made-up animals", asked_of(poses, random_figure(ANIMAL, random))

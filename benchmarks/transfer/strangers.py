@@ -26,7 +26,8 @@ from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe, 
 from training.evaluation import disturbances
 from training.inference.standing import STRANGE, Standing
 from training.inference.transfer import PoseTransfer
-from training.viz.transfer_picture import NamedMesh, shown, write_picture
+from training.viz.comparison_figure import comparison_figure
+from training.viz.transfer_picture import NamedMesh, shown
 from workflows.pretrained import weights_named
 
 Change = Callable[[Mesh], Mesh]
@@ -77,7 +78,7 @@ def main() -> None:
     for first in range(0, len(rows), _IN_A_PICTURE):
         path = options.folder / f"strangers-{first // _IN_A_PICTURE + 1}.png"
         options.folder.mkdir(parents=True, exist_ok=True)
-        print(write_picture(rows[first : first + _IN_A_PICTURE], path, panel=_PANEL))
+        print(comparison_figure(rows[first : first + _IN_A_PICTURE], path, panel=_PANEL))
 
 
 def stretched(target: Mesh, posed: Mesh) -> str:

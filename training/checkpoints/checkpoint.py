@@ -45,17 +45,6 @@ from training.checkpoints.state_file import read_state
 from training.checkpoints.weights import cast_weights, read_header, read_weights
 from training.recipes.training import TrainingRecipe
 
-__all__ = [
-    "Checkpoint",
-    "CheckpointError",
-    "export_weights",
-    "is_finished",
-    "load_checkpoint",
-    "read_checkpoint",
-    "require_checkpoint",
-    "save_checkpoint",
-]
-
 log = logging.getLogger(__name__)
 Which = Literal["latest", "best", "result"] | int
 """The newest sound one; the best; that of a step; or a run's result: the newest, but where early stopping ended the

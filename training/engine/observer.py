@@ -54,11 +54,6 @@ class Meter:
         self._began, self._waited, self._steps = time.perf_counter(), 0.0, 0
 
 
-def snapshot_path(run: Path, step: int) -> Path:
-    """RUN/pictures/step-N.png."""
-    return run / "pictures" / f"step-{step:08d}.png"
-
-
 @dataclass
 class Observer:
     """What rank 0 alone measures with and writes to."""
@@ -83,7 +78,7 @@ class Observer:
 
     def draw(self, state: State, run: Path) -> None:
         """Draw a picture of fixed examples; one that cannot be drawn or written ends no training."""
-        path, title = snapshot_path(run, state.step), f"step {state.step:,}"
+        path, title = run / "pictures" / f"step-{state.step:08d}.png", f"step {state.step:,}"
         try:
             with state.learner.evaluated():
                 self.validation.draw(state.learner.network, path, title=title)

@@ -11,12 +11,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError
 from datagen.store import Dataset
 from training.evaluation.document import Table
-from training.evaluation.measure import POSE_TYPES, LoadedMethod, normalised, transfer_each
+from training.evaluation.measure import LoadedMethod, normalised, transfer_each
 from training.evaluation.results import Score, Triple
-from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of
+from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of, first_triples
 from training.evaluation.statistics import mean
 
 
@@ -37,23 +36,6 @@ class MeshKind:
     name: str
     dataset: Dataset
     poses: str
-
-    def triples(self, count: int) -> NDArray[np.integer]:
-        """The first ``count`` fixed evaluation triples, of unseen poses where there are any.
-
-        Raises
-        ------
-        DatasetError
-            There are none.
-        """
-        for pose_type in POSE_TYPES[::-1]:
-            found = self.dataset.evaluation_triples(pose_type)[:count]
-            if len(found):
-                return found
-        raise DatasetError(
-            f"{self.dataset.url} has no evaluation triples. Make one that has two evaluation identities: "
-            "--set data.identities.evaluation=2"
-        )
 
 
 @dataclass(frozen=True)
@@ -94,7 +76,8 @@ def pairs_with_truth(kinds: Sequence[MeshKind]) -> list[tuple[MeshKind, MeshKind
 
 def cases_between(source: MeshKind, target: MeshKind, count: int) -> list[Case]:
     """The first triples of the source's list, with target and truth in the target's mesh."""
-    triples = source.triples(count).tolist()
+    advice = "Make one that has two evaluation identities: --set data.identities.evaluation=2"
+    triples = first_triples(source.dataset, count, advice=advice).tolist()
     return [case_of(source.dataset, place, triple, target.dataset) for place, triple in enumerate(triples)]
 
 

@@ -77,21 +77,25 @@ class RobustnessRow(Score, SourceCount, Triple, Disturbed):
 
 
 def cases_of(dataset: Dataset, count: int) -> list[Case]:
+    """The first ``count`` of a dataset's fixed evaluation triples; see :func:`first_triples`."""
+    advice = "Make one that has: --set data.identities.evaluation=8 data.poses.unseen=200 data.triples.count=200"
+    triples = first_triples(dataset, count, advice=advice).tolist()
+    return [case_of(dataset, number, triple) for number, triple in enumerate(triples)]
+
+
+def first_triples(dataset: Dataset, count: int, *, advice: str) -> NDArray[np.integer]:
     """The first ``count`` of a dataset's fixed evaluation triples, with unseen poses where it has any.
 
     Raises
     ------
     DatasetError
-        It has no evaluation triples.
+        It has no evaluation triples; with ``advice``.
     """
     for pose_type in POSE_TYPES[::-1]:
         triples = dataset.evaluation_triples(pose_type)[:count]
         if len(triples):
-            return [case_of(dataset, number, triple) for number, triple in enumerate(triples.tolist())]
-    raise DatasetError(
-        f"{dataset.url} has no evaluation triples. Make one that has: --set data.identities.evaluation=8 "
-        "data.poses.unseen=200 data.triples.count=200"
-    )
+            return triples
+    raise DatasetError(f"{dataset.url} has no evaluation triples. {advice}")
 
 
 def case_of(dataset: Dataset, number: int, triple: Sequence[int], targets: Dataset | None = None) -> Case:

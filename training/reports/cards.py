@@ -86,7 +86,9 @@ def _model_facts(
     checkpoint: Checkpoint, recipe: TrainingRecipe, dataset: Dataset, home: Path
 ) -> dict[str, str | int | float | Code]:
     rows, provenance = read_journal(home / "metrics.jsonl"), provenance_of(home)
-    weights = checkpoint.path if checkpoint.path.is_file() else _weights_file(checkpoint.path)
+    weights = checkpoint.path
+    if not weights.is_file():
+        weights /= AVERAGE if checkpoint.has_average else WEIGHTS
     count = _parameter_count(recipe)
     clock = run_curve(rows, "meshes_per_second", batch=recipe.batch)
     hardware = "; ".join(provenance.get("hardware", {}).values()) or provenance.get("machine", "")
@@ -139,19 +141,14 @@ def _worse_than_nothing(rows: list[Row]) -> str:
 
 
 def _worse_columns(rows: list[Row], method: str, pose_type: str) -> list[str]:
+    own = next(iter(methods_of(rows)), "")
+
+    def mean(each: str, field: str) -> float:
+        return mean_of(rows, method=each, pose_type=pose_type, field=field)
+
     return [
-        column.heading.split(" x1e")[0]
-        for column in COLUMNS
-        if _mean(rows, _own(rows), pose_type, column.field) > _mean(rows, method, pose_type, column.field)
+        column.heading.split(" x1e")[0] for column in COLUMNS if mean(own, column.field) > mean(method, column.field)
     ]
-
-
-def _own(rows: list[Row]) -> str:
-    return next(iter(methods_of(rows)), "")
-
-
-def _mean(rows: list[Row], method: str, pose_type: str, field: str) -> float:
-    return mean_of(rows, method=method, pose_type=pose_type, field=field)
 
 
 def _network_words(recipe: TrainingRecipe) -> str:
@@ -176,10 +173,6 @@ def _parameter_count(recipe: TrainingRecipe) -> int:
         return sum(parameter.numel() for parameter in network_from(recipe.network).parameters())
 
 
-def _weights_file(folder: Path) -> Path:
-    return folder / (AVERAGE if (folder / AVERAGE).exists() else WEIGHTS)
-
-
 def _usage(home: Path) -> str:
     run, record = shown(home), read_record(home)
     model = (record and record.model) or MODEL
@@ -200,8 +193,6 @@ import mlflow
 model = mlflow.pyfunc.load_model("models:/{model}@{ALIAS}")
 model.predict({{"source": source_vertices, "target": target_vertices, "target_faces": target_faces}})"""
 
-
-__all__ = ["CONTACT_SHEET", "dataset_card", "model_card"]
 
 CONTACT_SHEET = "generate/contact-sheet.png"
 

@@ -71,12 +71,8 @@ def _row(dataset: Dataset, identity: int, poses: list[int]) -> list[Floats | Non
     """The meshes of an identity, None where the dataset has none."""
     there = set(dataset.grid.poses_of(identity).tolist())
     meshes = dict(zip(held := [pose for pose in poses if pose in there], dataset.vertices(identity, held), strict=True))
-    return [_standing(meshes[pose]) if pose in there else None for pose in poses]
+    return [meshes[pose] - bounding_box(meshes[pose]).centre if pose in there else None for pose in poses]
 
 
 def _appended(number: int, before: int) -> str:
     return ", appended" if number >= before else ""
-
-
-def _standing(vertices: Floats) -> Floats:
-    return vertices - bounding_box(vertices).centre

@@ -25,7 +25,6 @@ from training.reports.cards import dataset_card, model_card
 from training.reports.html import report_html
 from training.reports.markdown import report_markdown
 from training.reports.run_summary import what_was_run
-from training.tracking.provenance import this_commit, this_machine
 from training.tracking.record import read_record
 
 __all__ = [
@@ -45,8 +44,6 @@ __all__ = [
     "pictures_of",
     "plain",
     "report_is_current",
-    "this_commit",
-    "this_machine",
     "what_was_run",
     "with_best",
     "workflow_report",
@@ -145,15 +142,11 @@ def pictures_of(folder: Path, *, but: Sequence[str] = ()) -> tuple[Picture, ...]
 def _runs(out: Path, rows: Sequence[Row]) -> dict[str, Path]:
     """The trainings by the names that the rows give them: what a workflow trains, and what it trains beside it."""
     names = [name for name in methods_of(rows) if name not in CONTROLS and not name.endswith(PROJECTED)]
-    main = _name_of(out / "run")
+    main = recipe_of(require_checkpoint(out / "run", "result")).network.title
     if len(names) != 2 or main not in names:
         return {methods_of(rows)[0]: out / "run"}
     names.remove(main)
     return {main: out / "run", names[0]: out / "beside"}
-
-
-def _name_of(run: Path) -> str:
-    return recipe_of(require_checkpoint(run, "result")).network.title
 
 
 def _of(name: str, runs: Mapping[str, Path]) -> str:
@@ -195,12 +188,10 @@ def _viewer(evaluation: Path) -> tuple[EmbeddedPage, ...]:
 
 def _curves(run: Path) -> tuple[Picture, ...]:
     """The training curve, with the no-op baselines where the evaluation drew it, and the run's other figures."""
-    measured = [Picture(path, CAPTIONS[path.stem]) for path in _existing(run / "evaluation/figures/training-curve.png")]
-    return (*measured, *pictures_of(run / "figures", but=("training-curve",) if measured else ()))
-
-
-def _existing(*paths: Path) -> list[Path]:
-    return [path for path in paths if path.is_file()]
+    path = run / "evaluation/figures/training-curve.png"
+    if not path.is_file():
+        return pictures_of(run / "figures")
+    return (Picture(path, CAPTIONS[path.stem]), *pictures_of(run / "figures", but=(path.stem,)))
 
 
 def _title(name: str, dataset: Dataset) -> str:

@@ -14,11 +14,9 @@ from matplotlib.colors import to_rgb
 from datagen.common.arrays import Floats, Integers
 from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.page import Page
-from training.viz.render.camera import frame
-from training.viz.render.renderer import Camera, MeshLike, render_mesh
-from training.viz.style import PAGE, QUIET, ROLE_COLORS, saved
-
-__all__ = ["ROLE_COLORS", "contact_sheet"]
+from training.viz.render.camera import Camera, frame
+from training.viz.render.renderer import render_mesh
+from training.viz.style import PAGE, QUIET, saved
 
 _SHEET_HUES = ("#5B8CD1", "#E8995A", "#55A98F", "#B98BC6", "#D0AE48", "#CE7474")
 
@@ -87,7 +85,7 @@ _OCTAHEDRON_FACES = np.array([(x, y, z) for x in (0, 1) for y in (2, 3) for z in
 class Panel:
     """A mesh (any unit, Y up) where it is to stand, its colours (sRGB [3] or [v, 3]) and the words under it."""
 
-    mesh: MeshLike
+    mesh: Mesh
     colors: npt.ArrayLike
     caption: str = ""
 
@@ -148,10 +146,10 @@ def standing(vertices: Floats, anchor: Floats | None = None) -> Floats:
     return np.asarray(vertices - standing_point(vertices if anchor is None else anchor), np.float64)
 
 
-def drawable(mesh: MeshLike) -> Mesh:
+def drawable(mesh: Mesh) -> Mesh:
     """The mesh, or, where it has no faces, a small octahedron at each of its vertices."""
     if len(mesh.faces):
-        return Mesh(mesh.vertices, mesh.faces)
+        return mesh
     vertices = np.asarray(mesh.vertices, np.float64)
     corners = vertices[:, None] + _POINT_SIZE * np.ptp(vertices, axis=0).max() / 2 * _OCTAHEDRON
     faces = len(_OCTAHEDRON) * np.arange(len(vertices))[:, None, None] + _OCTAHEDRON_FACES

@@ -8,7 +8,7 @@ import numpy as np
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.look import Look
-from training.viz.render.camera import Camera, MeshLike, azimuth_of, frame
+from training.viz.render.camera import Camera, azimuth_of, frame
 
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
 
@@ -34,14 +34,14 @@ class Comparison:
     """
 
     title: str
-    source: MeshLike
-    target: MeshLike
-    outputs: Mapping[str, MeshLike]
-    truth: MeshLike | None = None
+    source: Mesh
+    target: Mesh
+    outputs: Mapping[str, Mesh]
+    truth: Mesh | None = None
     metrics: Mapping[str, str] = field(default_factory=dict)
     motion: "Motion | None" = None
 
-    def meshes(self) -> dict[str, MeshLike]:
+    def meshes(self) -> dict[str, Mesh]:
         """All meshes by name: ``source``, ``target``, ``output NAME`` for each method, ``truth`` if there is one."""
         given = {"source": self.source, "target": self.target}
         outputs = {output_of(name): mesh for name, mesh in self.outputs.items()}
@@ -52,7 +52,7 @@ class Comparison:
 class Motion:
     """A sequence: source and output of each frame, in the units and axes of the first, and frames a second."""
 
-    frames: Sequence[tuple[MeshLike, MeshLike]]
+    frames: Sequence[tuple[Mesh, Mesh]]
     rate: float
 
 
@@ -151,7 +151,7 @@ def placed_frames(comparison: Comparison) -> Iterator[tuple[Mesh, Mesh]]:
         yield Mesh(moved[0], source.faces), Mesh(moved[1], posed.faces)
 
 
-def look_at(mesh: MeshLike) -> Look | None:
+def look_at(mesh: Mesh) -> Look | None:
     """Return what the faces of a mesh look like by themselves, where it says so."""
     look = getattr(mesh, "look", None)
     return look if isinstance(look, Look) else None

@@ -217,12 +217,11 @@ def _means(outfit: str, kind: str, method: str, scores: list[Any], *, correspond
     values = {name: float(np.mean([getattr(its, name) for its in scores])) for name in measured}
     values["corresponding"] = corresponding
     parts = sorted({part for its in scores for part in its.parts})
-    by_part = {part: _of_part([its.parts[part] for its in scores if part in its.parts]) for part in parts}
+    by_part = {}
+    for part in parts:
+        means = np.nanmean([its.parts[part] for its in scores if part in its.parts], axis=0)
+        by_part[part] = dict(zip(_DISTANCES, means.tolist(), strict=True))
     return Measured(outfit, kind, method, values, by_part)
-
-
-def _of_part(values: list[Any]) -> dict[str, float]:
-    return dict(zip(_DISTANCES, np.nanmean(values, axis=0).tolist(), strict=True))
 
 
 def markdown(rows: list[Measured]) -> str:

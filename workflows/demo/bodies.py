@@ -57,11 +57,6 @@ class Figure:
         return self.outfit != BARE
 
 
-def animals_are_there() -> bool:
-    """Whether animals can be made without fetching anything."""
-    return cc0_animals.are_there()
-
-
 def parameter_names(kind: str) -> tuple[str, ...]:
     """The parameters that a slider each is for; an animal's first, its species, is none of them."""
     names = _body(Figure(kind, ())).parameter_names

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from datagen.characters import cc0_animals
 from workflows.demo.bodies import (
     ANIMALS_MISSING,
     BARE,
@@ -13,7 +14,6 @@ from workflows.demo.bodies import (
     DETAILS,
     SPECIES,
     Figure,
-    animals_are_there,
     parameter_names,
     random_figure,
 )  # fmt: skip
@@ -59,7 +59,7 @@ class BodyControls:
         self._gui, self._changed = gui, changed
         self._random = np.random.default_rng()
         self._is_setting = False
-        kinds = [name for name, kind in KINDS.items() if kind == PERSON or animals_are_there()]
+        kinds = [name for name, kind in KINDS.items() if kind == PERSON or cc0_animals.are_there()]
         self._kind = gui.add_dropdown("Body", (*kinds, OWN))
         self._detail = gui.add_dropdown("Mesh", tuple(DETAILS), hint="Anny's topologies; fewer vertices are faster")
         self._outfit = None

@@ -81,7 +81,10 @@ class Pose:
 
 def poses_of(kind: str, pose: Pose) -> Poses:
     """The one pose, over joints of people or of animals."""
-    drawn = _of_file(pose.file, int(pose.number)) if pose.file else _random(kind, pose.number)
+    if (file := pose.file) is not None:
+        drawn = Poses(file.joints, file.parents, file.draw(int(pose.number))[None])
+    else:
+        drawn = _random(kind, pose.number)
     rotations = drawn.rotations.copy()
     for joint, degrees in pose.turns:
         if joint in drawn.joints:
@@ -145,10 +148,6 @@ def _recorded(path: Path) -> PoseFile:
     rate = next(iter(read_arrays(path, ("mocap_framerate", "mocap_frame_rate")).values()), np.array(0.0))
     apart = round(float(rate) / _FRAMES_PER_SECOND) if rate.size == 1 and 0 < float(rate) < 1e4 else 1
     return PoseFile(path.stem, JOINTS, PARENTS, len(frames), lambda number: smpl_pose(frames[number]), max(apart, 1))
-
-
-def _of_file(file: PoseFile, number: int) -> Poses:
-    return Poses(file.joints, file.parents, file.draw(number)[None])
 
 
 def _random(kind: str, number: float) -> Poses:

@@ -16,6 +16,7 @@ from training.evaluation.tables import COLUMNS, about_weights, mean_of, methods_
 from training.inference.predict import load_trained
 from training.inference.projection import PROJECTED, OntoParts
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
+from training.reports.card_texts import span, vertex_counts
 from training.reports.examples import comparisons_of, draw_comparisons
 from training.reports.plots.training_curve import draw_training_curve
 from training.tracking.record import CONTENT, Record, about_dataset, flatten, has_record, read_record, update_record
@@ -180,17 +181,10 @@ def _types(rows: list[Row]) -> list[str]:
 
 
 def _title(dataset: Dataset) -> str:
-    least, most = _vertex_counts(dataset)
-    counts = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    counts = span(vertex_counts(dataset, "evaluation"))
     return f"Pose transfer on {dataset.recipe.body.family} bodies of {counts} vertices"
 
 
 def emd_points_of(recipe: EvaluationRecipe, dataset: Dataset) -> int:
     """Vertices that the earth mover's distance is taken of: as asked, or as many as there are."""
-    return min(recipe.emd_points, _vertex_counts(dataset)[1])
-
-
-def _vertex_counts(dataset: Dataset) -> tuple[int, int]:
-    """The fewest and the most vertices of the identities that are evaluated."""
-    counts = [dataset.vertex_count(identity) for identity in dataset.identities("evaluation") or [0]]
-    return min(counts), max(counts)
+    return min(recipe.emd_points, max(vertex_counts(dataset, "evaluation")))

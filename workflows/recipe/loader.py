@@ -118,17 +118,6 @@ def change_recipe(base: Path | dict[str, Any], overrides: Sequence[str], *, wher
         return WorkflowRecipe.model_validate(values)
 
 
-def override_values(overrides: Sequence[str]) -> dict[str, Any]:
-    """Nested values of ``section.key=value`` words.
-
-    Raises
-    ------
-    RecipeError
-        A word is not of that form.
-    """
-    return changed({}, parse_words(overrides, option="--set "))
-
-
 def _named_by(words: Words) -> tuple[str | None, Words]:
     """The training recipe that ``training=NAME`` asks for, if any, and the other overrides, which refine it."""
     names = [value for key, value in words if key == "training" and isinstance(value, str)]

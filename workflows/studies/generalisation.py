@@ -1,4 +1,4 @@
-"""Generalisation as a command: its files, what it prints."""
+"""The study of generalisation: its files, what it prints."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -23,24 +23,11 @@ from workflows.pipeline.ray_cluster import require_reachable
 from workflows.pipeline.stage import say
 from workflows.pipeline.weights_argument import Evaluated
 from workflows.recipe.loader import load_recipe
-from workflows.studies.common import (
-    Study,
-    about_weights,
-    folder_of,
-    methods_of,
-    metric_name,
-    run_study,
-    weights_of,
-)
+from workflows.studies.common import Study, about_weights, folder_of, methods_of, metric_name, weights_of
 from workflows.studies.mesh_kinds import imported_kind, make_kinds, own_kind, own_recipe
 from workflows.studies.sizes import Sizes
 
 _FIRST_RECIPE = "quickstart"
-
-
-def generalisation_command(options: argparse.Namespace) -> None:
-    """Transfer between bodies and vertex counts that the weights were not trained on, and measure it."""
-    run_study(GeneralisationStudy(options))
 
 
 class GeneralisationStudy(Study[GeneralisationRow]):

@@ -55,11 +55,6 @@ def people_recipe(base: DatasetRecipe, topology: AnnyTopology, sizes: Sizes) -> 
     return _sized(body.model_copy(update={"topology": topology}), human_poses(base, sizes), sizes)
 
 
-def standin_recipe(base: DatasetRecipe, model: Path, sizes: Sizes) -> DatasetRecipe:
-    """Bodies of a model file in SMPL's format, in the same poses."""
-    return _sized(SmplBody(path=str(model.absolute())), human_poses(base, sizes), sizes)
-
-
 def animals_recipe(sizes: Sizes) -> DatasetRecipe:
     """The CC0 animals in moments of their own clips."""
     poses = PoseRecipe(seen=sizes.poses, unseen=0, distribution=ClipPoses(clips=_CLIPS), seed=sizes.seed)
@@ -98,7 +93,10 @@ def make_kinds(
     made = [_kind(people_recipe(base, topology, sizes), folder / f"{topology}.zarr") for topology in topologies]
     for other in others:
         try:
-            made.append(_standin(base, folder, sizes) if other == "smpl" else _animals(folder, sizes))
+            if other == "smpl":
+                made.append(_standin(base, folder, sizes))
+            else:
+                made.append(_kind(animals_recipe(sizes), folder / "animals.zarr"))
         except DsffnetError as error:
             say(f"left out: {other}: {error}")
     return made
@@ -108,16 +106,14 @@ def _standin(base: DatasetRecipe, folder: Path, sizes: Sizes) -> MeshKind:
     model = folder / "smpl-standin.npz"
     if not model.exists():
         write_standin("smpl", model)
-    return _kind(standin_recipe(base, model, sizes), folder / "smpl-standin.zarr")
-
-
-def _animals(folder: Path, sizes: Sizes) -> MeshKind:
-    return _kind(animals_recipe(sizes), folder / "animals.zarr")
+    recipe = _sized(SmplBody(path=str(model.absolute())), human_poses(base, sizes), sizes)
+    return _kind(recipe, folder / "smpl-standin.zarr")
 
 
 def _kind(recipe: DatasetRecipe, url: Path) -> MeshKind:
     dataset = generate(recipe, str(url.absolute()))
-    return MeshKind(kind_name(dataset), dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
+    name = f"{_family(recipe)} {_counts(dataset)}"
+    return MeshKind(name, dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
 
 
 def imported_kind(url: str) -> MeshKind:
@@ -125,11 +121,6 @@ def imported_kind(url: str) -> MeshKind:
     dataset = open_dataset(url)
     name = printable(Path(url).name.removesuffix(".zarr"))
     return MeshKind(f"{name} {_counts(dataset)}", dataset, dataset.uuid)
-
-
-def kind_name(dataset: Dataset) -> str:
-    """What a kind is called in tables: whose meshes, and how many vertices."""
-    return f"{_family(dataset.recipe)} {_counts(dataset)}"
 
 
 def own_kind(recipe: DatasetRecipe, kinds: Sequence[MeshKind]) -> str:

@@ -1,4 +1,4 @@
-"""Robustness as a command: its files, what it prints."""
+"""The study of robustness: its files, what it prints."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -31,22 +31,9 @@ from training.reports.plots.robustness import (
 )
 from workflows.pipeline.progress import bar
 from workflows.pipeline.ray_cluster import require_reachable
-from workflows.studies.common import (
-    Study,
-    about_weights,
-    folder_of,
-    methods_of,
-    metric_name,
-    run_study,
-    weights_of,
-)
+from workflows.studies.common import Study, about_weights, folder_of, methods_of, metric_name, weights_of
 
 _KNOWN = tuple(disturbance.name for disturbance in DISTURBANCES)
-
-
-def robustness_command(options: argparse.Namespace) -> None:
-    """Disturb the source (noise, missing parts, other sampling, rotation) and measure what comes out."""
-    run_study(RobustnessStudy(options))
 
 
 class RobustnessStudy(Study[RobustnessRow]):

@@ -190,7 +190,8 @@ class TransferWork:
         """The outputs, with a bar for those of a sequence; those that picture and page show are kept."""
         count = self.job.count
         kept = {count * place // _SHOWN_FRAMES for place in range(_SHOWN_FRAMES)}
-        played = range(0, count, self._frames_apart) if self._is_played else range(0)
+        is_played = self.job.viewer and self.job.is_sequence
+        played = range(0, count, self._frames_apart) if is_played else range(0)
         frames = self.posed()
         if self.job.is_sequence:
             from workflows.pipeline.progress import bar
@@ -202,10 +203,6 @@ class TransferWork:
             if number in played:
                 self._played[number] = Mesh(posed.vertices.astype(np.float32), posed.faces)
             yield posed
-
-    @property
-    def _is_played(self) -> bool:
-        return self.job.viewer and self.job.is_sequence
 
     @cached_property
     def _frames_apart(self) -> int:
@@ -222,7 +219,9 @@ class TransferWork:
         return apart
 
     def _draw(self) -> None:
-        from training.viz.transfer_picture import shown, write_page, write_picture
+        from training.viz.comparison_figure import comparison_figure
+        from training.viz.transfer_picture import PANEL, shown
+        from training.viz.viewer import write_viewer
 
         job, target = self.job, self._upright_target(self.target.mesh, self.job.target)
         if job.picture or not job.is_sequence:
@@ -231,9 +230,10 @@ class TransferWork:
                 for number, posed in self._shown.items()
             ]
         if job.picture:
-            write_picture(rows, job.beside(".png"))
+            comparison_figure(rows, job.beside(".png"), panel=PANEL)
         if job.viewer:
-            write_page([self._sequence(target)] if job.is_sequence else rows, job.beside(".html"))
+            transfers = [self._sequence(target)] if job.is_sequence else rows
+            write_viewer(transfers, job.beside(".html"), title="Pose transfer")
 
     def _place(self, number: int) -> Path:
         return self.job.frame_file(number) if self.job.is_sequence else self.job.out

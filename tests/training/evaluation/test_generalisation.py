@@ -110,8 +110,9 @@ def test_a_network_that_needs_equal_counts_gets_no_other(kinds: list[MeshKind], 
 
 def test_a_kind_without_triples_is_refused(tmp_path: Path) -> None:
     data = generate(tiny_dataset(identities={"training": 2, "evaluation": 1}), str(tmp_path / "one.zarr"))
+    kind = MeshKind("one", data, "")
     with pytest.raises(DatasetError, match="no evaluation triples"):
-        MeshKind("one", data, "").triples(3)
+        cases_between(kind, kind, 3)
 
 
 def test_heat_map_and_picture_are_drawn(

@@ -9,7 +9,8 @@ from PIL import Image as Pillow
 
 from datagen.mesh.formats.surface import Image, Material, Surface
 from training.viz.look import look_of
-from training.viz.render.renderer import Camera, render_mesh
+from training.viz.render.camera import Camera
+from training.viz.render.renderer import render_mesh
 
 CORNERS = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])
 SQUARE = Surface(np.arange(4), np.array([4]), uvs=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))

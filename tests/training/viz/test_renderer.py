@@ -6,17 +6,11 @@ import sys
 import numpy as np
 import pytest
 
-from datagen.mesh.geometry import Mesh
-from training.viz.render.renderer import (
-    BACKGROUND,
-    Camera,
-    Floats,
-    frame,
-    ground_shadow,
-    openness,
-    render_mesh,
-    vertex_normals,
-)
+from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh, vertex_normals
+from training.viz.render.camera import Camera, frame
+from training.viz.render.lighting import ground_shadow, openness
+from training.viz.render.renderer import BACKGROUND, render_mesh
 
 FRONT = Camera(eye=(0, 0, 10), target=(0, 0, 0), field_of_view=30)
 

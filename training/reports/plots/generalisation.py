@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from datagen.mesh.geometry import Mesh, bounding_box
 from training.evaluation.generalisation import GeneralisationRow, grid_of, no_op_line
-from training.evaluation.measure import LoadedMethod, in_words, transfer_each
+from training.evaluation.measure import LoadedMethod
 from training.evaluation.robustness import NO_OP, Case, methods_in
-from training.viz.mesh_grid import ROLE_COLORS, Panel, Row, mesh_grid, standing
-from training.viz.style import DPI, INK, PAGE, saved, short
+from training.reports.plots.robustness import TAKES_EQUAL, count_of, output_panel
+from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
+from training.viz.style import DPI, INK, PAGE, ROLE_COLORS, saved, short
 
 _COLORS = colormaps["YlGnBu"]
 _NO_TRUTH = "#eceef1"
@@ -116,8 +117,8 @@ def _panels(shown: Shown, methods: Sequence[LoadedMethod]) -> list[Panel | str]:
     size = float(bounding_box(case.target.vertices).half)  # a horse beside a person: each drawn as large as the other
     source = case.source.vertices * size / float(bounding_box(case.source.vertices).half)
     found: list[Panel | str] = [
-        Panel(Mesh(standing(source), case.source.faces), ROLE_COLORS["source"], _count(case.source)),
-        Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], _count(case.target)),
+        Panel(Mesh(standing(source), case.source.faces), ROLE_COLORS["source"], count_of(case.source)),
+        Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], count_of(case.target)),
     ]
     found += [_output(shown, method) for method in methods]
     truth = Panel(Mesh(standing(case.truth.vertices), case.truth.faces), ROLE_COLORS["truth"])
@@ -127,14 +128,5 @@ def _panels(shown: Shown, methods: Sequence[LoadedMethod]) -> list[Panel | str]:
 def _output(shown: Shown, method: LoadedMethod) -> Panel | str:
     case = shown.case
     if method.equal_counts and len(case.source.vertices) != len(case.target.vertices):
-        return "needs as many\nvertices as the target"
-    (output,) = transfer_each(method.network, [(case.source, case.target)])
-    box = bounding_box(case.truth.vertices)
-    vertices = standing(box.restore(output), case.truth.vertices if shown.truth_known else None)
-    found = case.score(output)
-    caption = in_words(found) if shown.truth_known else "no ground truth"
-    return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
-
-
-def _count(mesh: Mesh) -> str:
-    return f"{len(mesh.vertices):,} vertices"
+        return TAKES_EQUAL
+    return output_panel(method, case, case.source, truth_known=shown.truth_known)

@@ -17,6 +17,7 @@ from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, logarithmic, 
 
 _ABREAST = 5
 _BODY_METRES = 1.7
+TAKES_EQUAL = "needs as many\nvertices as the target"
 
 
 def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str], *, title: str) -> Path:
@@ -113,14 +114,14 @@ def disturbance_picture(
     truth = case.truth.vertices
     sources = [disturbed(case, disturbance, amount) for disturbance, amount in chosen]
     reference = Panel(Mesh(standing(case.target.vertices), case.target.faces), ROLE_COLORS["target"], "target")
-    changed = [Panel(_stood(source), ROLE_COLORS["source"], _count(source)) for source in sources]
+    changed = [Panel(_stood(source), ROLE_COLORS["source"], count_of(source)) for source in sources]
     page = [Row("source", [reference, *changed])]
     for number, method in enumerate(methods):
         whole = Panel(Mesh(standing(truth), case.truth.faces), ROLE_COLORS["truth"], "ground truth")
         panels: list[Panel | str] = ["" if number else whole]
         for (disturbance, _), source in zip(chosen, sources, strict=True):
             taken = not refusal(method, disturbance)
-            panels.append(_output(method, case, source) if taken else "needs as many\nvertices as the target")
+            panels.append(output_panel(method, case, source) if taken else TAKES_EQUAL)
         page.append(Row(method.name.replace(" ", "\n", 1), panels))
     headings = ["", *(_heading(disturbance, amount) for disturbance, amount in chosen)]
     return mesh_grid(page, path, columns=headings, title=title, one_scale=False)
@@ -133,11 +134,12 @@ def _heading(disturbance: Disturbance, amount: float) -> str:
     return f"{disturbance.heading}\n{words}"
 
 
-def _output(method: LoadedMethod, case: Case, source: Mesh) -> Panel:
+def output_panel(method: LoadedMethod, case: Case, source: Mesh, *, truth_known: bool = True) -> Panel:
+    """What a method makes of a case with this source, standing where the truth does; its error, where that is known."""
     (output,) = transfer_each(method.network, [(source, case.target)])
-    found = case.score(output)
-    vertices = standing(bounding_box(case.truth.vertices).restore(output), case.truth.vertices)
-    caption = in_words(found)
+    truth = case.truth.vertices
+    vertices = standing(bounding_box(truth).restore(output), truth if truth_known else None)
+    caption = in_words(case.score(output)) if truth_known else "no ground truth"
     return Panel(Mesh(vertices, case.target.faces), ROLE_COLORS["output"], caption)
 
 
@@ -146,7 +148,8 @@ def _stood(mesh: Mesh) -> Mesh:
     return Mesh(standing(shown.vertices), shown.faces)
 
 
-def _count(mesh: Mesh) -> str:
+def count_of(mesh: Mesh) -> str:
+    """How many vertices a mesh has, in words."""
     return f"{len(mesh.vertices):,} {'vertices' if len(mesh.faces) else 'points'}"
 
 

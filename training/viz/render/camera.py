@@ -2,25 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from datagen.common.arrays import Floats, Integers
+from datagen.common.arrays import Floats
+from datagen.mesh.geometry import Mesh
 
 _ELEVATION = 12.0
-
-
-class MeshLike(Protocol):
-    """Anything with ``vertices`` [v, 3] (float) and ``faces`` [f, 3] (int)."""
-
-    @property
-    def vertices(self) -> Floats:
-        """Positions [v, 3], Y up."""
-
-    @property
-    def faces(self) -> Integers:
-        """Triangles [f, 3], indices into the vertices."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +33,7 @@ class Camera:
 
 
 def frame(
-    meshes: Sequence[MeshLike],
+    meshes: Sequence[Mesh],
     *,
     size: tuple[int, int] = (320, 400),
     azimuth: float | None = None,
@@ -78,7 +66,7 @@ def frame(
     return Camera(eye=_triple(target + distance * direction), target=_triple(target))
 
 
-def azimuth_of(meshes: Sequence[MeshLike]) -> float:
+def azimuth_of(meshes: Sequence[Mesh]) -> float:
     """Return degrees from the front: a horse seen head-on hides its body, a person seen from the side hides a leg."""
     widths, depths = np.array([np.ptp(np.asarray(mesh.vertices, float), axis=0)[[0, 2]] for mesh in meshes]).T
     return 62.0 if np.median(depths / np.maximum(widths, 1e-12)) > 1.7 else 28.0

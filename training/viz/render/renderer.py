@@ -9,21 +9,9 @@ import numpy.typing as npt
 from datagen.common.arrays import Floats, Integers
 from datagen.mesh.geometry import Mesh, vertex_normals
 from training.viz.look import Look
-from training.viz.render.camera import Camera, MeshLike, checked_vertices, frame
-from training.viz.render.lighting import ground_shade, ground_shadow, lighting, openness
+from training.viz.render.camera import Camera, checked_vertices, frame
+from training.viz.render.lighting import ground_shade, lighting, openness
 from training.viz.render.rasterizer import on_plane, planes, rasterise
-
-__all__ = [
-    "BACKGROUND",
-    "CLAY",
-    "Camera",
-    "MeshLike",
-    "frame",
-    "ground_shadow",
-    "openness",
-    "render_mesh",
-    "vertex_normals",
-]
 
 CLAY = (0.72, 0.74, 0.78)
 BACKGROUND = (0.975, 0.978, 0.982)

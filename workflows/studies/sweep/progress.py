@@ -65,13 +65,11 @@ class SweepProgress:
 
     def summary(self) -> str:
         """How many trials have ended, and where each of the running ones is."""
-        running = [name for name in self._journals if name not in self._ended and self._is_moving(name)]
+        moving = (name for name, row in self._latest.items() if row.get("step", 0) > self._at_first[name])
+        running = [name for name in moving if name not in self._ended]
         places = [f"{name} step {self._latest[name]['step']:,}{_shown(self._latest[name])}" for name in running]
         counts = f"{len(self._ended)}/{len(self._journals)} trials, {len(running)} running"
         return "; ".join([counts, *places])
-
-    def _is_moving(self, name: str) -> bool:
-        return self._latest[name].get("step", 0) > self._at_first[name]
 
     def _made(self) -> dict[str, int]:
         return {name: int(row.get("step", 0)) for name, row in self._latest.items()}

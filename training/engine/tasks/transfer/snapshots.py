@@ -15,9 +15,9 @@ from datagen.mesh.geometry import Mesh, standing_point
 from training.data.batch import Batch
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
-from training.viz.mesh_grid import ROLE_COLORS
-from training.viz.render.renderer import Camera, frame, render_mesh
-from training.viz.style import DPI, INK, PAGE, QUIET, saved
+from training.viz.render.camera import Camera, frame
+from training.viz.render.renderer import render_mesh
+from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, saved
 
 COLUMNS = {"source": "Source", "target": "Target", "output": "Output", "truth": "Ground truth"}
 _PANEL, _MARGIN, _HEAD, _GAP = (230, 260), 16, 84, 10
