@@ -2,7 +2,8 @@
 
 import importlib.metadata
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from datagen.bodies import BodyModel, load_body, require_joints
 from datagen.common.assets import git
 from datagen.generate.identities import describe_identities, joined, stored_identities
-from datagen.generate.runners import Progress, Runner, Task, inline, unseen
+from datagen.generate.runners import Progress, Runner, Task, closable, inline, unseen
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
@@ -87,10 +88,11 @@ def plan_of(
     there = (before.grid.identity_count, before.grid.pose_count) if before else (0, 0)
     work = _Work(recipe, run, progress)
     seconds = SECONDS_IDENTITY + recipe.body.seconds_a_mesh
-    described = work.blocks(describe_identities, range(there[0], grid.identity_count), seconds, unit="identity")
-    people = joined([stored_identities(before), *described] if before else described)
-    drawn = work.blocks(draw_rotations, range(there[1], grid.pose_count), SECONDS_POSE, unit="pose")
-    rotations = [each.rotations for each in sorted(drawn, key=attrgetter("first"))]
+    numbers = range(there[0], grid.identity_count), range(there[1], grid.pose_count)
+    with closing(work.blocks(describe_identities, numbers[0], seconds, unit="identity")) as described:
+        people = joined([stored_identities(before), *described] if before else described)
+    with closing(work.blocks(draw_rotations, numbers[1], SECONDS_POSE, unit="pose")) as drawn:
+        rotations = [each.rotations for each in sorted(drawn, key=attrgetter("first"))]
     labelled = {"labelled": list(people.labels)} if people.labels else {}
     return Plan(
         attributes={**head.attributes, "rigs": people.parts, **labelled},
@@ -128,14 +130,19 @@ class _Work:
     run: Runner
     progress: Progress
 
-    def blocks(self, task: Task, numbers: range, seconds: float, *, unit: str) -> Iterator[Any]:
-        """Results of a task over blocks of numbers, each of which takes some seconds; one block is not shown."""
+    def blocks(self, task: Task, numbers: range, seconds: float, *, unit: str) -> Generator[Any]:
+        """Results of a task over blocks of numbers, each of which takes some seconds; one block is not shown.
+
+        Closing them ends the tasks that still run.
+        """
         size = min(_MOST_IN_BLOCK, max(1, int(_BLOCK_SECONDS / seconds)))
         blocks = [numbers[start : start + size] for start in range(0, len(numbers), size)]
-        results = self.run(task, [("", self.recipe, block) for block in blocks])
-        if len(blocks) < 2:
-            return results
-        return self.progress(((len(result), result) for result in results), unit=unit, total=len(numbers), done=0)
+        with closing(closable(self.run(task, [("", self.recipe, block) for block in blocks]))) as results:
+            if len(blocks) < 2:
+                yield from results
+            else:
+                sized = ((len(result), result) for result in results)
+                yield from self.progress(sized, unit=unit, total=len(numbers), done=0)
 
 
 def prepare(

@@ -166,6 +166,12 @@ class RemoteObjects(FsspecStore):
             RemoteObjects._warned = time.monotonic()
 
     def _unanswered(self, error: Exception) -> StorageError:
+        if _is_refused(error):
+            return StorageError(
+                f"{self.url} refuses access ({reason_of(error)}). The credentials need to list there, to read, and to "
+                "write where anything is made (S3: s3:ListBucket, s3:GetObject, s3:PutObject, s3:DeleteObject; without "
+                "the first S3 also answers so where an object is missing)"
+            )
         return StorageError(
             f"{self.url} cannot be reached ({reason_of(error)}). Check its address and your credentials (for S3: "
             "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL), then run the same command again: it resumes "
@@ -175,8 +181,11 @@ class RemoteObjects(FsspecStore):
 
 def _is_hopeless(error: Exception) -> bool:
     """Whether it will be the same in a minute: no credentials, not the right ones, or not what is done there."""
-    refused = isinstance(error, PermissionError) or getattr(error, "status", None) in _REFUSED
-    return refused or type(error).__name__ in _HOPELESS
+    return _is_refused(error) or type(error).__name__ in _HOPELESS
+
+
+def _is_refused(error: Exception) -> bool:
+    return isinstance(error, PermissionError) or getattr(error, "status", None) in _REFUSED
 
 
 def _of_the_store(error: Exception) -> bool:

@@ -103,6 +103,30 @@ def test_identities_described_in_blocks_in_any_order_are_those_described_at_once
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
+@pytest.mark.parametrize("task", ["describe_identities", "draw_rotations"])
+def test_tasks_have_ended_when_what_they_give_cannot_be_used(task: str) -> None:
+    """Before shards are made, too: whoever gets the error may begin again at once."""
+    running = list[str]()
+
+    def run(asked: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        running.append(asked.__name__)
+        try:
+            yield from inline(asked, arguments)
+        finally:
+            running.remove(asked.__name__)
+
+    def shown(results: Iterator[tuple[int, Any]], **_: Any) -> Iterator[Any]:
+        for _, result in results:
+            if running == [task]:
+                raise KeyboardInterrupt
+            yield result
+
+    recipe = tiny_dataset(identities={"training": 1100, "evaluation": 1}, poses={"seen": 1100, "unseen": 1})
+    with pytest.raises(KeyboardInterrupt) as caught:
+        plan.plan_of(recipe, run=run, progress=shown)
+    assert caught.value and not running  # the error still refers to what was under way
+
+
 @pytest.mark.parametrize("stop_after", [0, 2])
 def test_what_was_made_before_an_interruption_is_neither_described_nor_read_again(
     dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int

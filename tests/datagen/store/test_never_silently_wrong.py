@@ -257,6 +257,15 @@ def test_an_append_cut_short_while_it_begins_reads_no_shard_afterwards(
     assert looked and {identity for shard in looked for identity in shard.identities} == {5}
 
 
+def test_a_note_that_a_killed_writer_left_of_a_complete_dataset_is_ignored_and_goes_with_the_next_append(
+    spoilable: Path, tmp_path: Path
+) -> None:
+    whole = tree_hash(append(str(shutil.copytree(spoilable, tmp_path / "whole")), training=4).url)
+    (spoilable / "manifest/so_far").write_bytes(b"as it was before the last shards")
+    assert not list(find_faults(str(spoilable)))
+    assert tree_hash(append(str(spoilable), training=4).url) == whole
+
+
 def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     require_same_assets.cache_clear()
     shard = shards_of(tiny_dataset())[0]

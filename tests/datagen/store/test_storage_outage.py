@@ -115,11 +115,19 @@ class NoCredentialsError(EndpointConnectionError):
 NoCredentialsError.__module__ = "botocore.exceptions"
 
 
-@pytest.mark.parametrize("error", [PermissionError(errno.EACCES, "Access Denied"), NoCredentialsError("none")])
-def test_what_no_time_mends_is_not_waited_for(url: str, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (PermissionError(errno.EACCES, "Access Denied"), r"refuses access \(.*Access Denied\).*s3:ListBucket"),
+        (NoCredentialsError("none"), "cannot be reached .*Check its address and your credentials"),
+    ],
+)
+def test_what_no_time_mends_is_not_waited_for(
+    url: str, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
+) -> None:
     monkeypatch.setattr(remote_objects, "PATIENCE", 60.0)
     failing(monkeypatch, iter(lambda: error, None))
-    with pytest.raises(StorageError, match="credentials"):
+    with pytest.raises(StorageError, match=says):
         open_dataset(url)
 
 
