@@ -91,7 +91,10 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
         say(f"{name}: {_about(steps * seconds)}, {seconds:.2g} s a step{budget}")
         total += steps * seconds
     if total:
-        say(f"trainings: {_about(total)} in all; data, evaluation and report take a few minutes more")
+        say(
+            f"trainings: {_about(total)} in all while this machine is as busy as now; once they run, their progress "
+            "says how long is left, as measured. Data, evaluation and report take a few minutes more"
+        )
 
 
 def _about(seconds: float) -> str:
