@@ -4,6 +4,7 @@ python -m benchmarks.clothed.template field
 python -m benchmarks.clothed.template roots
 python -m benchmarks.clothed.template template FOLDER [--steps 1250]
 python -m benchmarks.clothed.template skin docs/images/skin.png
+python -m benchmarks.clothed.template rest
 """
 
 import argparse
@@ -25,10 +26,12 @@ from datagen.bodies import load_body
 from datagen.bodies.anny.model import AnnyModel
 from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.skinning import skin
+from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, vertex_normals
 from datagen.mesh.rig import skinned
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, ClothedBody, PoseRecipe
+from datagen.recipe.clothed import OUTFITS
 from training.avatar.body import CanonicalBody, canonical_body
 from training.avatar.diffusion import SkinningField, ThinPlate, diffused_skinning, thin_plate
 from training.avatar.occupancy import FrameSamples, frame_samples, hand_samples
@@ -71,20 +74,11 @@ class Subject:
     @cached_property
     def body(self) -> CanonicalBody:
         """With hips turned outwards."""
-        return self._body(np.pi / 12)
+        return _canonical(np.array(_PERSON), np.pi / 12)
 
     def resting(self) -> CanonicalBody:
         """The person in the T-pose."""
-        return self._body(0.0)
-
-    def _body(self, spread: float) -> CanonicalBody:
-        model = load_body(AnnyBody(topology="makehuman"))
-        assert isinstance(model, AnnyModel)
-        person = np.array(_PERSON)
-        rig = model.rig(person, JOINTS)
-        rig = replace(rig, weights=rig.weights[:_BODY_VERTICES])
-        vertices = model.rest(person).vertices[:_BODY_VERTICES]
-        return canonical_body(rig, vertices, body_faces(), JOINTS, PARENTS, spread=spread)
+        return _canonical(np.array(_PERSON), 0.0)
 
     def scans(self, poses: Poses) -> list[list[Mesh]]:
         """The whole body and the parts of the outfit in each pose."""
@@ -100,6 +94,20 @@ class Subject:
                 parts = [faces[(labels[faces] == part).all(axis=1)] for part in range(1, labels.max() + 1)]
                 scan.extend(Mesh(posed, part) for part in parts)
         return found
+
+
+def _anny() -> AnnyModel:
+    model = load_body(AnnyBody(topology="makehuman"))
+    assert isinstance(model, AnnyModel)
+    return model
+
+
+def _canonical(person: NDArray[np.float64], spread: float) -> CanonicalBody:
+    model = _anny()
+    rig = model.rig(person, JOINTS)
+    rig = replace(rig, weights=rig.weights[:_BODY_VERTICES])
+    vertices = model.rest(person).vertices[:_BODY_VERTICES]
+    return canonical_body(rig, vertices, body_faces(), JOINTS, PARENTS, spread=spread)
 
 
 def field(centres: int) -> None:
@@ -279,6 +287,36 @@ def draw_skinning(path: Path) -> None:
     mesh_grid(rows, path, columns=["at rest", *_postures()], title=title, one_scale=True, size=(330, 330))
 
 
+def around_rest() -> None:
+    """How far nine tenths of a mesh lie from a person at rest at most, as shares of the person's extent.
+
+    Garments of the outfits at rest, other people at rest, and the person in other poses: what `dsffnet skin` warns by.
+    """
+    body = Subject().resting()
+    solid, extent = Solid(body.vertices, body.faces), float(np.ptp(body.vertices, axis=0).max())
+
+    def say(what: str, vertices: NDArray[np.floating]) -> None:
+        print(f"{what}: {np.quantile(np.abs(solid.depth(vertices)), 0.9) / extent:.3f}", flush=True)
+
+    for outfit in OUTFITS:
+        resting = Subject(outfit, "skinned").scans(_pose({}))[0]
+        for number, part in enumerate(resting[1:], 1):
+            say(f"{outfit}, part {number}", part.vertices[np.unique(part.faces)])
+    for number in range(6):
+        other = _canonical(_anny().draw_identity(generator(99, Stream.IDENTITY, number), number), 0.0).vertices
+        say(f"another person, {np.ptp(other, axis=0).max() / extent:.2f} times as large", other)
+    lowered = {f"arms lowered by {angle}": _arms(-angle) for angle in (10, 20, 45, 70)}
+    bent = _pose({"left_knee": (40, 0, 0), "right_knee": (40, 0, 0)})
+    several = draw_poses(PoseRecipe(), range(4))
+    drawn = {f"pose {n} of NPT": replace(several, rotations=several.rotations[n : n + 1]) for n in range(4)}
+    for what, pose in (lowered | {"knees bent by 40": bent} | _postures() | drawn).items():
+        say(what, skinned(body.vertices, body.weights, body.transforms(pose.world(), JOINTS))[0])
+
+
+def _arms(angle: int) -> Poses:
+    return _pose({"left_shoulder": (0, 0, angle), "right_shoulder": (0, 0, -angle)})
+
+
 def _dressed(
     body: NDArray[np.floating],
     garment: NDArray[np.floating],
@@ -342,7 +380,7 @@ def _pose(turned: dict[str, tuple[int, int, int]]) -> Poses:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["field", "roots", "template", "skin"])
+    parser.add_argument("what", choices=["field", "roots", "template", "skin", "rest"])
     parser.add_argument("folder", nargs="?", metavar="PATH", type=Path, default=Path("build/avatar"))
     parser.add_argument("--centres", type=int, default=2500)
     parser.add_argument("--outfit", default="skirt", help="an outfit, or: bare")
@@ -358,5 +396,7 @@ if __name__ == "__main__":
         roots(4)
     elif given.what == "skin":
         draw_skinning(given.folder)
+    elif given.what == "rest":
+        around_rest()
     else:
         template(Run(given.seen, given.unseen, given.steps, given.width), Subject(given.outfit), given.folder)
