@@ -1,7 +1,9 @@
 """How long a training step takes on this machine, tried before there are data."""
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import torch
 
@@ -18,11 +20,19 @@ _LONG = 5.0  # a first step beyond which there is no second
 _VERTICES = 4096  # of the meshes of a trial: examples beyond them are counted, not tried
 
 
-def seconds_a_step(recipe: TrainingRecipe, *, vertices: int) -> float:
+class StepTime(NamedTuple):
+    """Seconds of a step: ``now``, beside whatever else the machine does, and ``alone``, if it did nothing else."""
+
+    now: float
+    alone: float
+
+
+def seconds_a_step(recipe: TrainingRecipe, *, vertices: int) -> StepTime:
     """Seconds of a step of so many vertices a mesh on this machine's CPU, all ranks at work, as a mean of a run.
 
     Random vertices go forward and back through a network of the recipe's, and its optimiser takes a step. Ranks are
-    threads here, which share the cores as processes do.
+    threads here, which share the cores as processes do. Alone it would take a rank's own thread about as long as that
+    was on a core.
     """
     vertices = recipe.augmentation.subset or max(2, round(vertices * recipe.augmentation.vertices))
     share = -(-recipe.batch // recipe.ranks)
@@ -32,27 +42,33 @@ def seconds_a_step(recipe: TrainingRecipe, *, vertices: int) -> float:
     try:
         with ThreadPoolExecutor(recipe.ranks) as ranks:
             found = [ranks.submit(_tried, recipe, tried, share / tried, vertices) for _ in range(recipe.ranks)]
-            return _MORE * max(each.result() for each in found)
+            times = [each.result() for each in found]
+            return StepTime(*(_MORE * max(each) for each in zip(*times, strict=True)))
     finally:
         torch.set_num_threads(before)
 
 
-def _tried(recipe: TrainingRecipe, examples: int, times: float, vertices: int) -> float:
+def _tried(recipe: TrainingRecipe, examples: int, times: float, vertices: int) -> StepTime:
     network = network_from(recipe.network)
     optimiser = build_optimiser(network, recipe)
     source, target = torch.rand((2, examples, vertices, 3), generator=torch.Generator().manual_seed(0))
-    seconds: list[float] = []
-    began = time.perf_counter()
-    while len(seconds) < 2 or time.perf_counter() - began < _SECONDS:
-        start = time.perf_counter()
+
+    def pass_through() -> None:
         optimiser.zero_grad()
         network(source=source, target=target).square().mean().backward()
-        between = time.perf_counter()
-        optimiser.step()
-        moving = time.perf_counter() - between
-        if recipe.optimiser == "muon":  # which ranks share
-            moving /= recipe.ranks
-        seconds.append((between - start) * times + moving)
-        if seconds[0] > _LONG:
+
+    seconds: list[StepTime] = []
+    began = time.perf_counter()
+    while len(seconds) < 2 or time.perf_counter() - began < _SECONDS:
+        passing, moving = _timed(pass_through), _timed(optimiser.step)
+        share = recipe.ranks if recipe.optimiser == "muon" else 1  # which ranks share
+        seconds.append(StepTime(*(one * times + other / share for one, other in zip(passing, moving, strict=True))))
+        if seconds[0].now > _LONG:
             return seconds[0]
     return min(seconds[1:])  # the first one also allocates; what else the machine does for a moment makes others longer
+
+
+def _timed(work: Callable[[], object]) -> StepTime:
+    began, before = time.perf_counter(), time.thread_time()
+    work()
+    return StepTime(time.perf_counter() - began, time.thread_time() - before)

@@ -18,6 +18,9 @@ from workflows.pipeline.tasks import ray_from
 _SOON = 1e6
 """Vertices in the triples of all steps of a training that is over before a forecast would be worth a word."""
 
+_BUSY = 1.5
+"""Times as long as alone that trainings would take beside what else the machine does, where that is worth a word."""
+
 
 def announce_size(recipe: DatasetRecipe, url: str, *, anew: bool, yes: bool, local: bool = False) -> None:
     """Say what a dataset takes before it is made at ``url``; of a complete one that stays as it is, nothing.
@@ -78,7 +81,12 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
 
     if recipe.body.expected_vertices is None or on_cluster():
         return
-    total, vertices, grid = 0.0, round(recipe.body.expected_vertices), recipe.identities.training * recipe.poses.seen
+    alone, now, vertices, grid = (
+        0.0,
+        0.0,
+        round(recipe.body.expected_vertices),
+        recipe.identities.training * recipe.poses.seen,
+    )
     for name, training in trainings.items():
         steps, shown = training.last_step(grid // training.batch), training.augmentation.subset or vertices
         if steps * training.batch * shown < _SOON or _on_gpu(training):
@@ -88,13 +96,12 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
         say(f"{name}: trying a few steps, to tell how long {steps:,} will take here")
         seconds = seconds_a_step(training, vertices=vertices)
         budget = f", in commands of {training.budget} each" if training.budget else ""
-        say(f"{name}: {_about(steps * seconds)}, {seconds:.2g} s a step{budget}")
-        total += steps * seconds
-    if total:
-        say(
-            f"trainings: {_about(total)} in all while this machine is as busy as now; once they run, their progress "
-            "says how long is left, as measured. Data, evaluation and report take a few minutes more"
-        )
+        say(f"{name}: {_about(steps * seconds.alone)}, {seconds.alone:.2g} s a step{budget}")
+        alone, now = alone + steps * seconds.alone, now + steps * seconds.now
+    if alone:
+        is_busy = now > _BUSY * alone
+        beside = f" if this machine does nothing else, {_about(now)} while it is as busy as now" if is_busy else ""
+        say(f"trainings: {_about(alone)} in all{beside}; data, evaluation and report take a few minutes more")
 
 
 def _about(seconds: float) -> str:

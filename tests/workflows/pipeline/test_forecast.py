@@ -5,7 +5,7 @@ import torch
 
 from tests.support.recipes import tiny_training
 from training.engine import step_time
-from training.engine.step_time import seconds_a_step
+from training.engine.step_time import StepTime, seconds_a_step
 from training.recipes.training import TrainingRecipe
 from workflows.pipeline import forecast
 from workflows.pipeline.forecast import announce_times
@@ -17,11 +17,16 @@ LONG = tiny_training(steps=30_000, batch=8, device="cpu")
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The vertices of the meshes that steps were tried with; a step takes 0.01 s."""
+    return trying(monkeypatch, StepTime(0.012, 0.01))
+
+
+def trying(monkeypatch: pytest.MonkeyPatch, found: StepTime) -> list[int]:
+    """Let steps that are tried take so long; the vertices that they were tried with."""
     seen: list[int] = []
 
-    def seconds(recipe: TrainingRecipe, *, vertices: int) -> float:
+    def seconds(recipe: TrainingRecipe, *, vertices: int) -> StepTime:
         seen.append(vertices)
-        return 0.01
+        return found
 
     monkeypatch.setattr(step_time, "seconds_a_step", seconds)
     monkeypatch.setattr(forecast, "on_cluster", lambda: False)
@@ -37,7 +42,27 @@ def test_each_training_and_all_of_them_are_told_in_minutes(
     assert tried == [96, 96]
     assert said[0] == "train: trying a few steps, to tell how long 30,000 will take here"
     assert said[1] == "train: about 5 min, 0.01 s a step" and said[3] == "train-beside: about 10 min, 0.01 s a step"
-    assert said[4].startswith("trainings: about 15 min in all while this machine is as busy as now;") and len(said) == 5
+    assert said[4].startswith("trainings: about 15 min in all;") and len(said) == 5
+
+
+def test_a_busy_machine_is_told_of_beside_what_it_would_take_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trying(monkeypatch, StepTime(0.1, 0.01))
+    announce_times(load_recipe("smoke", []).data, {"train": LONG})
+    *_, train, total = (line.partition("] ")[2] for line in capsys.readouterr().out.splitlines())
+    assert train == "train: about 5 min, 0.01 s a step"
+    alone_and_now = "about 5 min in all if this machine does nothing else, about 50 min while it is as busy as now;"
+    assert total.startswith(f"trainings: {alone_and_now}")
+
+
+def test_what_a_step_waits_for_others_is_not_its_own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, own = iter(range(1000)), iter(float(n) / 4 for n in range(1000))
+    monkeypatch.setattr(step_time, "_SECONDS", 0.0)
+    monkeypatch.setattr(step_time, "_MORE", 1.0)
+    monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(step_time.time, "thread_time", lambda: next(own))
+    assert seconds_a_step(tiny_training(batch=2), vertices=20) == StepTime(1 + 1, 0.25 + 0.25)
 
 
 @pytest.mark.parametrize("case", ["short", "on a GPU", "on a cluster", "vertices that only files tell"])
@@ -61,7 +86,7 @@ def test_steps_of_every_kind_are_tried_and_nothing_of_it_stays(
     given = {"network": {"name": network}, "augmentation": {"subset": 20}, "edge_weight": 0}
     recipe = tiny_training(**given, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
     before = torch.get_num_threads()
-    assert seconds_a_step(recipe, vertices=20) > 0
+    assert min(seconds_a_step(recipe, vertices=20)) > 0
     assert torch.get_num_threads() == before
 
 
@@ -71,7 +96,7 @@ def test_examples_that_are_too_many_to_try_are_counted(monkeypatch: pytest.Monke
     monkeypatch.setattr(step_time, "_VERTICES", 40)
     monkeypatch.setattr(step_time, "_MORE", 1.0)
     monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
-    few, many = (seconds_a_step(tiny_training(batch=batch), vertices=20) for batch in (2, 8))
+    few, many = (seconds_a_step(tiny_training(batch=batch), vertices=20).now for batch in (2, 8))
     assert (few, many) == (1 + 1, 4 + 1)  # one second each way, forward and back of a batch of two, the optimiser
 
 
@@ -83,4 +108,4 @@ def test_ranks_share_the_time_that_moving_matrices_takes(
     monkeypatch.setattr(step_time, "_SECONDS", 0.0)
     monkeypatch.setattr(step_time.time, "perf_counter", lambda: float(next(clock)))
     recipe = tiny_training(optimiser="muon", batch=2, ranks=ranks, launcher="ray")
-    assert step_time._tried(recipe, 1, 1.0, 20) == seconds
+    assert step_time._tried(recipe, 1, 1.0, 20).now == seconds
