@@ -1,22 +1,19 @@
 """By how many degrees weights err that find how a mesh stands: ``python -m benchmarks.transfer.standing human``.
 
-Anny bodies that the weights have not seen, of several vertex layouts, turned in several ways, and how badly the weights
-understand the twelve CC0 animals. Set OMP_NUM_THREADS=1 on a busy machine.
+Anny bodies that the weights have not seen, of several vertex layouts, turned in several ways. Set OMP_NUM_THREADS=1 on
+a busy machine.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datagen.bodies import load_body
-from datagen.characters.cc0_animals import animal_files
-from datagen.mesh.files import read_mesh_file
 from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe
 from training.inference.transfer import PoseTransfer
@@ -35,8 +32,6 @@ def main() -> None:
     transfer = PoseTransfer.from_run(weights_named(parser.parse_args().weights))
     for topology, identities, poses in BODIES:
         report_found(transfer, list(anny(topology, identities, poses)))
-    misfits = sorted(transfer.misfit(read_animal(path)) for path in animal_files())
-    print(f"animals as they stand: misfit {misfits[0]:.4f} to {misfits[-1]:.4f}")
 
 
 def anny(topology: AnnyTopology, identities: int, poses: int) -> Iterator[NDArray[np.float64]]:
@@ -47,11 +42,6 @@ def anny(topology: AnnyTopology, identities: int, poses: int) -> Iterator[NDArra
         parameters = body.draw_identity(np.random.default_rng(1000 + identity), identity)
         drawn = draw_poses(recipe, np.arange(identity * poses, (identity + 1) * poses))
         yield from body.vertices(parameters, drawn).astype(np.float64)
-
-
-def read_animal(path: Path) -> NDArray[np.floating]:
-    """Vertices of an animal at rest; the stag's without its horns, which are a mesh of their own."""
-    return read_mesh_file(path, geometries=["Stag"] if path.stem == "stag" else []).mesh.vertices
 
 
 def report_found(transfer: PoseTransfer, meshes: list[NDArray[np.floating]]) -> None:

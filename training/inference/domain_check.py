@@ -18,7 +18,7 @@ from datagen.common.arrays import Floats
 from datagen.common.errors import DsffnetError
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from training.inference.orientation import POOR_ERROR, TURN, Axes, Orientation, axes_as_options
-from training.inference.standing import STRANGE, Standing
+from training.inference.standing import MISREAD, Standing
 from training.tracking.provenance import FILE, Provenance, provenance_of
 
 if TYPE_CHECKING:
@@ -118,11 +118,11 @@ def remarks(
     seen
         What the network saw, None where that is not known.
     doubt
-        Why the mesh may be no body that a network which finds how it stands knows; by default its misfit says so.
+        Why the mesh may be no body that a network which finds how it stands knows; by default its rest error says so.
     """
     upright = axes.turned(mesh.vertices)
     if isinstance(axes, Standing):
-        fits, line = not doubt and axes.misfit <= STRANGE, doubt or _about_a_stranger(name, axes)
+        fits, line = not doubt and axes.rest_error <= MISREAD, doubt or _about_a_stranger(name, axes)
     elif way is None:
         fits, line = True, ""
     else:
@@ -141,8 +141,8 @@ def remarks(
 
 def _about_a_stranger(name: str, found: Standing) -> str:
     return (
-        f"{name} is unlike the bodies of training, however it is turned (misfit {found.misfit:.4f}, above "
-        f"{STRANGE}). {POOR}"
+        f"{name} is unlike the bodies of training, however it is turned (misread by {found.rest_error:.0f} degrees, "
+        f"more than {MISREAD:g}). {POOR}"
     )
 
 

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
 from datagen.common.errors import CheckpointError, MeshError
-from datagen.mesh.geometry import Mesh, bounding_box, check_mesh
-from training.inference.predict import load_trained, surfaces_of
-from training.inference.standing import STRANGE, facing, misfit, standing, understanding_of
-from training.networks.layers.sampling import sample
+from datagen.mesh.geometry import Mesh, check_mesh
+from training.inference.predict import load_trained
+from training.inference.standing import MISREAD, facing, sampled, standing, understanding_of
 from training.networks.parts import Parts
 
 
@@ -70,13 +69,11 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
         axes = axes or standing(understand, mesh.vertices)  # the others may turn round
         upright = axes.turned(mesh.vertices)
         turn = facing(understand, upright, turn)
-        ahead = upright @ turn
-        if (left := misfit(understand, ahead)) > STRANGE:
+        drawn = sampled(network, Mesh(upright @ turn, mesh.faces))
+        reading = network.read(drawn.vertices, drawn)
+        if (error := float(network.rest_error(reading, drawn))) > MISREAD:
             raise MeshError(
-                f"mesh {number} is no body whose pose these weights know (misfit {left:.3f}, more than "
-                f"{STRANGE}). Look at it, or leave it out"
+                f"mesh {number} is no body whose pose these weights know (misread by {error:.0f} degrees, more than "
+                f"{MISREAD:g}). Look at it, or leave it out"
             )
-        vertices = torch.from_numpy(bounding_box(ahead).normalise(ahead).astype(np.float32))[None]
-        surface = surfaces_of(network, sources=[mesh], targets=[mesh])["source_surface"]
-        drawn = sample(vertices, surface)
-        yield turn @ network.read(drawn.vertices, drawn).rotations[0].double().numpy()
+        yield turn @ reading.rotations[0].double().numpy()

@@ -1,5 +1,7 @@
 """How a body stands, found by a network that says how well it understands one (`Parts.understood`).
 
+Whether it is such a body at all, another question, is asked of it once it stands (`Parts.rest_error`).
+
 Unlike :mod:`training.inference.orientation`, which asks of any network whether a mesh comes back from it, this finds
 turns between the axes as well, so that it is done without being asked for.
 """
@@ -15,7 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import bounding_box
+from datagen.mesh.geometry import Mesh, bounding_box
+from training.inference.predict import surfaces_of
+from training.networks.layers.sampling import Sample, sample
 from training.networks.parts import Parts
 
 Understanding = Callable[[Floats], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -36,8 +40,9 @@ def understanding_of(network: Parts) -> Understanding:
     return understand
 
 
-STRANGE = 0.01
-"""Misfit above which a mesh is no body that the network knows, however it is turned."""
+MISREAD = 8.5
+"""Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
+animals that were read rightly have 8 at most, but for two all that is something else has more (docs/transfer.md)."""
 KNOWN = 0.003
 """Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
@@ -61,10 +66,13 @@ class Standing:
         [3, 3].
     misfit
         In the normalised box.
+    rest_error
+        In degrees (`Parts.rest_error`); NaN where nobody asked.
     """
 
     matrix: NDArray[np.float64]
     misfit: float
+    rest_error: float = np.nan
 
     def turned(self, vertices: Floats) -> Floats:
         """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z."""
@@ -124,6 +132,20 @@ def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float
 def misfit(understand: Understanding, vertices: Floats) -> float:
     """Return how badly a mesh [n, 3] is understood as it stands."""
     return float(understand(_boxed(_probe(vertices))[None])[0][0])
+
+
+@torch.no_grad()
+def rest_error(network: Parts, mesh: Mesh) -> float:
+    """Return by how many degrees a mesh that stands as the training data is misread (`Parts.rest_error`)."""
+    drawn = sampled(network, mesh)
+    return float(network.rest_error(network.read(drawn.vertices, drawn), drawn))
+
+
+def sampled(network: Parts, mesh: Mesh) -> Sample:
+    """Return what a network reads of a mesh, in its box, with what is near along the surface."""
+    vertices = bounding_box(mesh.vertices).normalise(mesh.vertices).astype(np.float32)[None]
+    surface = surfaces_of(network, sources=[mesh], targets=[mesh])["source_surface"]
+    return sample(torch.from_numpy(vertices).to(next(network.parameters()).device), surface)
 
 
 class _Seen(NamedTuple):

@@ -22,7 +22,7 @@ from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained, surfaces_of
 from training.inference.projection import OntoParts
-from training.inference.standing import Standing, facing, misfit, standing, understanding_of
+from training.inference.standing import Standing, facing, misfit, rest_error, standing, understanding_of
 from training.networks.execution import GraphedTransfer, Precision
 from training.networks.layers.surface import Surface
 from training.networks.parts import Parts
@@ -194,6 +194,11 @@ class PoseTransfer:
         """How badly the parts network, or that which projects, understands a mesh [n, 3] that stands upright."""
         assert self._parts is not None
         return misfit(understanding_of(self._parts), vertices)
+
+    def rest_error(self, mesh: Mesh) -> float:
+        """By how many degrees the parts network, or that which projects, misreads a mesh that stands upright."""
+        assert self._parts is not None
+        return rest_error(self._parts, mesh)
 
     def _turned_round(self, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
         """The turn about the vertical [3, 3] by which a frame faces, if the network can say; ``before``: the last."""

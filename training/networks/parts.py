@@ -179,6 +179,21 @@ class Parts(nn.Module):
             facing = torch.atan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2])
             return misfit / moments.mass.sum(1).clamp_min(1e-12), facing
 
+    @torch.no_grad()
+    def rest_error(self, reading: Reading, drawn: Sample) -> Tensor:
+        """Return by how much the network misreads meshes of which it read the sample alone, in degrees [b].
+
+        By the reading each mesh is posed to rest and read again: all parts should stand as at rest. The root of the
+        mean over the parts of the squared angle by which they do not. Of a body that is read rightly that is a few
+        degrees, whatever it wears; what is no body makes another mesh at rest than the network took it for.
+        """
+        with full_precision(drawn.vertices):
+            weights = (_SHARPNESS * reading.logits).softmax(2)
+            at_rest = self.posed(drawn.vertices, weights, reading.joints, reading.rotations.mT)
+            found = self._read_again(at_rest, drawn).rotations
+            cosine = (found.diagonal(dim1=2, dim2=3).sum(2) - 1) / 2
+            return torch.rad2deg(cosine.clamp(-1, 1).acos()).square().mean(1).sqrt()
+
     def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Return the weights [b, n, part] by which vertices [b, n, 3] are posed, more certain than as they are read."""
         return (_SHARPNESS * self.part(self._features(vertices, drawn))).softmax(2)
@@ -211,8 +226,7 @@ class Parts(nn.Module):
         turns = wanted @ own.rotations.mT
 
         def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
-            again = with_masses(drawn.rows, taken(output, drawn.rows), drawn.masses > 0, drawn.surface)
-            found = self.read(again.vertices, again).rotations
+            found = self._read_again(taken(output, drawn.rows), drawn).rotations
             return found, (wanted - found).square().sum((1, 2, 3))
 
         output = self.posed(target, weights, own.joints, turns)
@@ -220,6 +234,11 @@ class Parts(nn.Module):
         corrected = self.posed(target, weights, own.joints, wanted @ found.mT @ turns)
         is_better = read_again(corrected)[1] <= missing
         return torch.where(is_better[:, None, None], corrected, output)
+
+    def _read_again(self, moved: Tensor, drawn: Sample) -> Reading:
+        """Return what is read off the sample's vertices [b, k, 3] where they came to lie."""
+        again = with_masses(drawn.rows, moved, drawn.masses > 0, drawn.surface)
+        return self.read(again.vertices, again)
 
     def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""

@@ -29,9 +29,9 @@ _OF_THE_PAGE = {
 """What messages say that a command line is to do, and what is done here."""
 _OPTION = re.compile(r"(?<!\S)--([a-z]+)(=?)")
 _PMD = "PMD: mean square of {} in the truth's box, boxes centred alike"
-_MISFIT = (
-    "*misfit*: how badly the weights understand a mesh: what is left where each part is its rest, turned, a mean of "
-    "squares in the mesh's box. Bodies like those of training have 0.002 or less."
+_MISREAD = (
+    "*misread*: the weights say how each part of a mesh is turned; turned back by that and read again, all should "
+    "stand as at rest. By how many degrees they do not. Bodies like those of training have some 4."
 )
 _BAR = ",".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * ERROR_COLORS[::51])
 
@@ -65,7 +65,7 @@ def about(outcome: Outcome, folder: Path) -> str:
     frames = f"{len(outcome.frames)} of {outcome.count} frames, " if outcome.count > 1 else ""
     lines = [f"{frames}{vertices} in **{outcome.seconds:.2f} s** by the weights `{outcome.weights}`"]
     warnings = [f"⚠ {plain(warning, folder)}" for warning in outcome.warnings]
-    words = [_MISFIT] if any("(misfit " in warning for warning in warnings) else []
+    words = [_MISREAD] if any("misread by" in warning for warning in warnings) else []
     return "\n\n".join([*lines, *warnings, *words])
 
 

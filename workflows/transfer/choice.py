@@ -8,7 +8,7 @@ from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
 from training.inference.domain_check import POOR
 from training.inference.orientation import Axes
-from training.inference.standing import KNOWN, Standing
+from training.inference.standing import KNOWN, MISREAD, Standing
 from training.inference.transfer import PoseTransfer
 from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
@@ -16,8 +16,6 @@ from workflows.transfer.job import TransferJob
 Pair = tuple[Standing, Standing]
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
-_UNDERSTOOD = {"human": 0.008, "animals": 0.004}
-"""Misfit by the weights up to which a mesh is what they know; people in dresses have 0.007 (docs/networks.md)."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +40,21 @@ class Chosen:
 def standings(transfer: PoseTransfer, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> Pair:
     """How source and target stand: as a person says, or as the network finds."""
     source, target = (
-        _told(transfer, axes, mesh) if job.is_told and axes else transfer.standing(mesh.vertices)
+        _standing(transfer, mesh, axes if job.is_told else None)
         for axes, mesh in zip(job.axes or (None, None), meshes, strict=True)
     )
-    assert isinstance(source, Standing) and isinstance(target, Standing)
     return source, target
 
 
-def _told(transfer: PoseTransfer, axes: Axes, mesh: Mesh) -> Standing:
-    return Standing(axes.matrix, transfer.misfit(axes.turned(mesh.vertices)))
+def _standing(transfer: PoseTransfer, mesh: Mesh, axes: Axes | None) -> Standing:
+    """How a mesh stands, by ``axes`` where a person says so, and how badly it is read then."""
+    if axes:
+        found = Standing(axes.matrix, transfer.misfit(axes.turned(mesh.vertices)))
+    else:
+        stands = transfer.standing(mesh.vertices)
+        assert isinstance(stands, Standing)
+        found = stands
+    return replace(found, rest_error=transfer.rest_error(Mesh(found.turned(mesh.vertices), mesh.faces)))
 
 
 def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Load | None = None) -> Chosen:
@@ -66,7 +70,7 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     """
     load = load or PoseTransfer.from_run
     people = Chosen.of(own_weights("human"), job, meshes, load)
-    if all(found.misfit <= KNOWN for found in people.standings):
+    if all(found.misfit <= KNOWN and found.rest_error <= MISREAD for found in people.standings):
         return people
     others = [name for name in KINDS if name != "human"]
     every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes, load) for name in others}
@@ -80,20 +84,19 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     known = job.target if target else job.sources[0] if source else None
     reason = f"the weights {taken} are taken, as {f'they know {known}' if known else 'for every such mesh'}. {POOR}"
     doubts = (
-        "" if source else f"{job.sources[0]} is {_neither(every, 0)}: {reason}",
-        "" if target else f"{job.target} is {_neither(every, 1)}: {reason}",
+        "" if source else f"{job.sources[0]} is {_neither(every, 0)}; {reason}",
+        "" if target else f"{job.target} is {_neither(every, 1)}; {reason}",
     )
     return replace(every[taken], doubts=doubts)
 
 
 def _kind(every: dict[str, Chosen], place: int) -> str | None:
-    """The weights by which a mesh is best understood, if any understands it."""
-    misfits = {name: each.standings[place].misfit for name, each in every.items()}
-    return min((name for name in every if misfits[name] <= _UNDERSTOOD[name]), key=misfits.__getitem__, default=None)
+    """The weights by which a mesh is read best, if any reads it."""
+    errors = {name: each.standings[place].rest_error for name, each in every.items()}
+    return min((name for name in every if errors[name] <= MISREAD), key=errors.__getitem__, default=None)
 
 
 def _neither(every: dict[str, Chosen], place: int) -> str:
-    misfits = "; ".join(
-        f"{name} {each.standings[place].misfit:.4f}, above {_UNDERSTOOD[name]}" for name, each in every.items()
-    )
-    return f"neither {' nor '.join(KINDS.values())} as the weights know them (misfit {misfits})"
+    errors = " and ".join(f"{each.standings[place].rest_error:.0f} ({name})" for name, each in every.items())
+    known = " nor ".join(KINDS.values())
+    return f"neither {known} as the weights know them: misread by {errors} degrees, more than {MISREAD:g}"

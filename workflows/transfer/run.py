@@ -20,7 +20,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
-from training.inference.standing import STRANGE, Standing
+from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from workflows.pipeline.console import warn
 from workflows.transfer.choice import Load, Pair, chosen, standings
@@ -89,8 +89,10 @@ class TransferWork:
             work._take(standings(work.transfer, job, meshes), weights)
         else:
             work._settle_axes(weights)
-        if job.project and work.transfer.misfit(work.axes[1].turned(target.mesh.vertices)) > STRANGE:
-            warn(f"{job.target} is no body that {job.project} knows: what it takes for parts may be none")
+        if job.project:
+            upright = Mesh(work.axes[1].turned(target.mesh.vertices), target.mesh.faces)
+            if work.transfer.rest_error(upright) > MISREAD:
+                warn(f"{job.target} is no body that {job.project} knows: what it takes for parts may be none")
         return work
 
     def _settle_axes(self, weights: Path) -> None:

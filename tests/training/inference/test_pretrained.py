@@ -12,7 +12,7 @@ from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PoseRecipe
-from training.inference.standing import STRANGE, Standing
+from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import point_mesh_distance
 from workflows.pretrained import weights_named
@@ -99,11 +99,13 @@ def test_another_sampling_of_the_source_changes_little(human: PoseTransfer) -> N
 
 
 def test_what_is_no_person_is_said_to_be_strange(human: PoseTransfer) -> None:
-    box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), [[0, 1, 2]])
+    box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), np.array([[0, 1, 2]]))
     found = human.standing(box.vertices)
-    assert isinstance(found, Standing) and found.misfit > STRANGE
-    known = human.standing(people(poses=1).target.vertices)
-    assert isinstance(known, Standing) and known.misfit < STRANGE / 2 and np.array_equal(known.matrix, np.eye(3))
+    assert human.rest_error(Mesh(found.turned(box.vertices), box.faces)) > 1.5 * MISREAD
+    target = people(poses=1).target
+    known = human.standing(target.vertices)
+    assert isinstance(known, Standing) and np.array_equal(known.matrix, np.eye(3))
+    assert human.rest_error(target) < 0.75 * MISREAD
 
 
 def _boxed(meshes: np.ndarray) -> np.ndarray:

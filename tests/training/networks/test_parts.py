@@ -9,8 +9,8 @@ from datagen.mesh.rig import part_transforms
 from tests.support.three_networks import lively, meshes
 from training.networks import build_network
 from training.networks.layers.rigid_parts import ancestors, matrices, moved_joints, rotations_from_six
-from training.networks.layers.sampling import nearness, offsets, sample
-from training.networks.parts import Parts, boxed
+from training.networks.layers.sampling import Sample, nearness, offsets, sample
+from training.networks.parts import Parts, Reading, boxed
 
 PARENTS = (-1, 0, 1, 0, 3)
 
@@ -101,3 +101,35 @@ def test_misfit_is_of_each_mesh_alone_and_does_not_see_the_vertices_order() -> N
     assert found.shape == facing.shape == (2,) and (found >= 0).all()
     torch.testing.assert_close(network.understood(vertices[1:])[0], found[1:])
     torch.testing.assert_close(network.understood(vertices[:, torch.randperm(60)])[0], found, rtol=1e-4, atol=1e-6)
+
+
+class Turning(Parts):
+    """Reads every part of every mesh as turned by so many degrees."""
+
+    degrees = 0.0
+
+    def read(self, vertices: torch.Tensor, drawn: Sample) -> Reading:
+        turn = torch.from_numpy(Rotation.from_euler("y", self.degrees, degrees=True).as_matrix()).float()
+        found = super().read(vertices, drawn)
+        return found._replace(rotations=turn.expand_as(found.rotations))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 180.0])
+def test_rest_error_is_what_is_read_of_a_mesh_at_rest(degrees: float) -> None:
+    network = Turning(joints={"pelvis": None, "head": "pelvis"}, width=8, token_width=8, blocks=1).eval()
+    drawn = sample(meshes(60, seed=4))
+    reading = network.read(drawn.vertices, drawn)
+    network.degrees = degrees
+    torch.testing.assert_close(network.rest_error(reading, drawn), torch.full((2,), degrees), atol=0.05, rtol=0)
+
+
+def test_rest_error_does_not_depend_on_how_the_mesh_is_turned_where_the_reading_follows() -> None:
+    """What counts is rest, not the pose that leads there: a reading that is turned along says the same."""
+    network, vertices = lively("parts").eval(), meshes(60, seed=4)
+    assert isinstance(network, Parts)
+    drawn = sample(vertices)
+    reading = network.read(drawn.vertices, drawn)
+    turn = torch.from_numpy(Rotation.from_euler("y", 90, degrees=True).as_matrix()).float()
+    along = reading._replace(rotations=turn @ reading.rotations, joints=reading.joints @ turn.mT)
+    lying = drawn._replace(vertices=drawn.vertices @ turn.mT)
+    torch.testing.assert_close(network.rest_error(along, lying), network.rest_error(reading, drawn), atol=0.1, rtol=0)

@@ -197,7 +197,7 @@ def test_an_animation_longer_than_the_page_plays_is_refused(
 
 
 def test_messages_name_the_controls_of_the_page_and_no_folder_of_the_server(legs: list[Path]) -> None:
-    mesh, way = load_mesh(legs[0]), Standing(np.eye(3), misfit=1.0)
+    mesh, way = load_mesh(legs[0]), Standing(np.eye(3), misfit=1.0, rest_error=30.0)
     name = str(legs[0].parent / "source-1" / "leg.obj")
     three = Mesh(
         np.concatenate([mesh.vertices + 9 * place for place in range(3)]),
@@ -221,9 +221,9 @@ def test_words_are_explained_where_they_are_said(session: Session, view: Seen, l
     outcome = session.outcome
     assert outcome is not None
     outcome.warnings = []
-    assert "misfit" not in about(outcome, session.folder)
-    outcome.warnings = ["leg.obj is unlike the bodies of training (misfit 0.02)"]
-    assert "*misfit*: how badly the weights understand a mesh" in about(outcome, session.folder)
+    assert "misread" not in about(outcome, session.folder)
+    outcome.warnings = ["leg.obj is unlike the bodies of training (misread by 20 degrees, more than 8.5)"]
+    assert "*misread*: the weights say how each part of a mesh is turned" in about(outcome, session.folder)
     assert not legend(outcome, outcome.frames[0], 1.0, shown=False)
     known = replace(outcome.frames[0], pmd=1e-4)
     for shown in (False, True):
