@@ -1,18 +1,24 @@
 """Ranks as processes of their own over gloo, as torchrun would start them, with a bound on how long they may take."""
 
 import json
+import multiprocessing
 import os
+import runpy
 import socket
-import subprocess
 import sys
 from collections.abc import Sequence
+from multiprocessing.context import ForkServerProcess
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
+import pytest
 import yaml
 
 from training.recipes.training import TrainingRecipe
 
 ROOT = Path(__file__).parents[3]
+_LIBRARIES = ["torch._dynamo", "scipy.optimize", "scipy.spatial", "zarr", "pydantic", "yaml", "matplotlib.figure"]
+multiprocessing.set_forkserver_preload(_LIBRARIES)
 
 
 def free_port() -> int:
@@ -22,6 +28,32 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
+class Forked(ForkServerProcess):
+    """``python -m MODULE ARGUMENTS`` begun within milliseconds, as a copy of a process that has imported the libraries.
+
+    The packages of this repository are imported anew in each; environment, signals and status are its own. What it
+    prints goes to the file ``output``.
+    """
+
+    def __init__(self, words: Sequence[str], output: Path, **environment: str) -> None:
+        super().__init__(daemon=True)
+        self.output, self._words, self._environment = output, list(words), {**os.environ, **environment}
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setenv("OMP_NUM_THREADS", "1")  # which torch reads when it is imported
+            ensure_running()
+        self.start()
+
+    def run(self) -> None:
+        with open(self.output, "w", encoding="utf-8") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+        os.environ.clear()
+        os.environ.update(self._environment)
+        os.chdir(ROOT)
+        sys.argv = self._words
+        runpy.run_module(self._words[0], run_name="__main__", alter_sys=True)
+
+
 def start_ranks(
     recipe: TrainingRecipe,
     *,
@@ -29,31 +61,24 @@ def start_ranks(
     run: Path,
     count: int,
     module: str = "training.engine",
-) -> list[subprocess.Popen[str]]:
+) -> list[Forked]:
     """Start ``count`` ranks of ``python -m module RECIPE DATA RUN``."""
     run.parent.mkdir(parents=True, exist_ok=True)
     path = run.parent / f"{run.name}-recipe.yaml"
     path.write_text(yaml.safe_dump(recipe.model_dump(mode="json")))
-    return _started([sys.executable, "-m", module, str(path), data, str(run)], count)
+    return _started([module, str(path), data, str(run)], count, run.parent)
 
 
-def _started(command: Sequence[str], count: int) -> list[subprocess.Popen[str]]:
+def _started(words: Sequence[str], count: int, place: Path) -> list[Forked]:
     shared = {
         "WORLD_SIZE": str(count),
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(free_port()),
         "OMP_NUM_THREADS": "1",
     }
+    outputs = [place / f"{Path(words[-1]).name}-{rank}.log" for rank in range(count)]
     return [
-        subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env={**os.environ, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in range(count)
+        Forked(words, output, **shared, RANK=str(rank), LOCAL_RANK=str(rank)) for rank, output in enumerate(outputs)
     ]
 
 
@@ -61,15 +86,18 @@ def train_in_turn(jobs: Sequence[tuple[TrainingRecipe, Path]], *, data: str, pla
     """Train every (recipe, run) by one group of ranks, one after the other; starting a group takes seconds."""
     path = place / "jobs.json"
     path.write_text(json.dumps([[recipe.model_dump(mode="json"), data, str(run)] for recipe, run in jobs]))
-    results = finish(_started([sys.executable, "-m", "tests.support.ranks", str(path)], count))
+    results = finish(_started(["tests.support.ranks", str(path)], count, place))
     assert [status for status, _ in results] == [0] * count, results
 
 
-def finish(ranks: list[subprocess.Popen[str]], *, timeout: float = 120) -> list[tuple[int, str]]:
+def finish(ranks: list[Forked], *, timeout: float = 120) -> list[tuple[int, str]]:
     """Exit status and output of each rank; all are killed if one hangs."""
     try:
-        return [(process.wait(timeout), process.stdout.read() if process.stdout else "") for process in ranks]
+        for process in ranks:
+            process.join(timeout)
+        assert all(process.exitcode is not None for process in ranks), f"not at an end after {timeout} s"
+        return [(process.exitcode, process.output.read_text()) for process in ranks]
     finally:
         for process in ranks:
             process.kill()
-            process.wait()
+            process.join()

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from datagen.common.errors import BudgetSpent, RecipeError, TrainingError
-from tests.support.ranks import ROOT
+from tests.support.ranks import ROOT, Forked, finish
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
 from training.engine import launch
@@ -128,19 +128,13 @@ def test_a_recipe_that_cannot_be_is_one_line_with_every_fault(
 
 
 def test_the_command(tmp_path: Path, dataset: str) -> None:
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "training.engine", *map(str, arguments)]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
-
     (tmp_path / "r.json").write_text(json.dumps({"training": tiny_training().model_dump(mode="json")}))
-    done = run(tmp_path / "r.json", dataset, tmp_path / "run", "steps=4", "schedule.name=constant")
-    assert done.returncode == 0, done.stderr
+    words = [tmp_path / "r.json", dataset, tmp_path / "run", "steps=4", "schedule.name=constant"]
+    subprocess.run([sys.executable, "-m", "training.engine", *map(str, words)], cwd=ROOT, timeout=100, check=True)
     assert require_checkpoint(tmp_path / "run").step == 4
     (tmp_path / "file").write_text("in the way")
-    for arguments, status in (
-        ((tmp_path / "r.json", dataset, tmp_path / "file"), 1),
-        ((tmp_path / "none.json", dataset, tmp_path / "run"), 2),
-    ):
-        failed = run(*arguments)
-        lines = [line for line in failed.stderr.splitlines() if line.startswith("error: ")]
-        assert failed.returncode == status and len(lines) == 1 and "Traceback" not in failed.stderr, failed.stderr
+    for recipe, run, expected in (("r.json", "file", 1), ("none.json", "run", 2)):
+        words = ["training.engine", str(tmp_path / recipe), dataset, str(tmp_path / run)]
+        ((status, said),) = finish([Forked(words, tmp_path / "said")])
+        lines = [line for line in said.splitlines() if line.startswith("error: ")]
+        assert status == expected and len(lines) == 1 and "Traceback" not in said, said

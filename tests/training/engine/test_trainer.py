@@ -138,7 +138,7 @@ def test_sigkill_of_a_rank_ends_the_other_and_a_restart_ends_equal(dataset: str,
     started = start_ranks(recipe, data=dataset, run=killed, count=2)
     while not list((killed / "checkpoints").glob("step-*")):
         time.sleep(0.01)
-    started[1].send_signal(signal.SIGKILL)
+    started[1].kill()
     (status, said), (of_the_killed, _) = finish(started, timeout=60)
     assert of_the_killed == -signal.SIGKILL and status == 1 and "Traceback" not in said
     assert said.splitlines()[-1].startswith("error: another rank has ended") and "same command again" in said
@@ -152,7 +152,7 @@ def test_sigterm_finishes_the_step_and_checkpoints(dataset: str, tmp_path: Path)
     while not read_journal(run / "metrics.jsonl"):
         time.sleep(0.05)
     began = time.monotonic()
-    rank.send_signal(signal.SIGTERM)
+    rank.terminate()
     ((status, output),) = finish(started, timeout=30)
     assert status == 143 and "stopped at step" in output, output
     assert time.monotonic() - began < 15
