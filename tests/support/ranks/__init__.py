@@ -8,10 +8,8 @@ import socket
 import sys
 from collections.abc import Sequence
 from multiprocessing.context import ForkServerProcess
-from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
-import pytest
 import yaml
 
 from training.recipes.training import TrainingRecipe
@@ -38,9 +36,6 @@ class Forked(ForkServerProcess):
     def __init__(self, words: Sequence[str], output: Path, **environment: str) -> None:
         super().__init__(daemon=True)
         self.output, self._words, self._environment = output, list(words), {**os.environ, **environment}
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setenv("OMP_NUM_THREADS", "1")  # which torch reads when it is imported
-            ensure_running()
         self.start()
 
     def run(self) -> None:

@@ -53,6 +53,7 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(full, "train_model", stage("train"))
     monkeypatch.setattr(full, "evaluate_weights", stage("evaluate"))
     monkeypatch.setattr(full, "workflow_report", report)
+    monkeypatch.setattr(full, "announce_times", lambda *_: None)  # which tries steps
     monkeypatch.setattr(generate, "is_complete", lambda *_: True)
     monkeypatch.setattr(full, "is_trained", lambda *_: True)
     monkeypatch.setattr(full, "is_evaluated", lambda recipe, data, run: read_record(run.evaluation.path) is not None)
