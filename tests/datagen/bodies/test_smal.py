@@ -9,13 +9,12 @@ import pytest
 from datagen.bodies import load_body, require_joints
 from datagen.bodies.smpl_family.model_search import FOLDER_VARIABLE, find_model
 from datagen.bodies.smpl_family.smal import SmalModel
-from datagen.bodies.standins.smpl_format import write_standin
 from datagen.common.errors import BodyError
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.poses import Poses, draw_poses, load_poses
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import PoseRecipe, RangePoses, SmalBody
-from tests.support.shapes.bodies import identity
+from tests.support.shapes.bodies import identity, standin_file
 from tests.support.shapes.models import Arrays, random_model, reference, save_npz, save_pickle
 
 RANGES = PoseRecipe(distribution=RangePoses(skeleton="smal", uniform=20))
@@ -39,7 +38,7 @@ def arrays_of(joints: int) -> Arrays:
 @pytest.fixture(scope="session")
 def animal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stand-in of SMAL."""
-    return write_standin("smal", tmp_path_factory.mktemp("smal") / "smal.npz")
+    return standin_file("smal", tmp_path_factory.mktemp("smal") / "smal.npz")
 
 
 @pytest.mark.parametrize("joints", [33, 34, 35])

@@ -119,7 +119,8 @@ def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(tmp_path: P
     file = read_model(save_npz(tmp_path / "m.npz", arrays_of("smpl")))
     body, world = LayoutBody(file, betas=10, reach=4), NPT.on(JOINTS, PARENTS)
     betas = np.random.default_rng(0).uniform(-4, 4, 10)
-    whole = body.vertices(betas, world)
+    with threadpool_limits(2):
+        whole = body.vertices(betas, world)
     with threadpool_limits(1):
         assert np.array_equal(whole[17], body.vertices(betas, world[17:18])[0])
     shuffled = np.random.default_rng(1).permutation(10)

@@ -1,9 +1,12 @@
 """A small recipe of every body family, with poses that it understands; files are made where they are needed."""
 
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from datagen.bodies.standins.smpl_format import write_standin
 from datagen.common.seeding import Stream, generator
@@ -30,13 +33,25 @@ def _anny(folder: Path) -> dict[str, Any]:
     return {"body": {"family": "anny", "topology": COARSE}, "distribution": NPT}
 
 
+@cache
+def _standin(kind: str) -> bytes:
+    with TemporaryDirectory() as folder, threadpool_limits(1):
+        return write_standin(kind, Path(folder) / "x.npz", topology=COARSE).read_bytes()  # type: ignore[arg-type]
+
+
+def standin_file(kind: str, path: Path) -> Path:
+    """The stand-in of a model at ``path``; making one takes seconds, so that each is made once a process."""
+    path.write_bytes(_standin(kind))
+    return path
+
+
 def _smpl(folder: Path, model: str = "smpl") -> dict[str, Any]:
-    path = write_standin(model, folder / f"{model}.npz", topology=COARSE)  # type: ignore[arg-type]
+    path = standin_file(model, folder / f"{model}.npz")
     return {"body": {"family": "smpl", "model": model, "path": str(path)}, "distribution": NPT}
 
 
 def _smal(folder: Path) -> dict[str, Any]:
-    path = write_standin("smal", folder / "smal.npz")
+    path = standin_file("smal", folder / "smal.npz")
     ranges = {"name": "ranges", "skeleton": "smal", "uniform": 15}
     return {"body": {"family": "smal", "path": str(path)}, "distribution": ranges}
 
