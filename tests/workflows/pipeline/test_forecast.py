@@ -1,9 +1,11 @@
 """How long trainings take is tried and said before anything is made, where this machine's CPU does them."""
 
+from typing import Any
+
 import pytest
 import torch
 
-from tests.support.recipes import tiny_training
+from tests.support.recipes import PARTS, tiny_training
 from training.engine import step_time
 from training.engine.step_time import StepTime, seconds_a_step
 from training.recipes.training import TrainingRecipe
@@ -78,13 +80,12 @@ def test_what_cannot_be_told_or_is_over_soon_is_not_tried(
 
 
 @pytest.mark.parametrize("optimiser", ["adamw", "muon"])
-@pytest.mark.parametrize("network", ["dsffnet", "parts"])
+@pytest.mark.parametrize("changes", [{"augmentation": {"subset": 20}}, PARTS], ids=["dsffnet", "parts"])
 def test_steps_of_every_kind_are_tried_and_nothing_of_it_stays(
-    network: str, optimiser: str, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any], optimiser: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(step_time, "_SECONDS", 0.0)
-    given = {"network": {"name": network}, "augmentation": {"subset": 20}, "edge_weight": 0}
-    recipe = tiny_training(**given, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
+    recipe = tiny_training(**changes, edge_weight=0, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
     before = torch.get_num_threads()
     assert min(seconds_a_step(recipe, vertices=20)) > 0
     assert torch.get_num_threads() == before
