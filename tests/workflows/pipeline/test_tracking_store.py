@@ -34,11 +34,6 @@ ROOT = Path(__file__).parents[3]
 AWKWARD = "a b #1 & 'q' \"d\" ; 日本é [x]{y}|~ $HOME 50:50 @=+,!<>"
 
 
-@pytest.fixture(autouse=True)
-def _no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-
-
 def recorded(out: Path, store: Path | None = None) -> Path:
     """A folder with a record, an artifact and, if asked for, a store with all its tables."""
     begin_record(out, name=out.name, kind="workflow", parent=None, parameters={"training.batch": "8"})

@@ -51,7 +51,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def transfer(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Transfer:
     """Run the command in this process, from the folder of the meshes; files go to tmp_path where they are ``out``."""
     monkeypatch.chdir(run.parent)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(*words: object) -> None:
         options = cli.parsed(["transfer", *map(str, words), "--model", str(run)])
@@ -440,7 +439,6 @@ def test_what_cannot_be_done_is_said_before_the_weights_are_read(
 
 def test_models_and_servers_that_are_not_there(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(run.parent)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     def call(model: str) -> None:
         options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model])

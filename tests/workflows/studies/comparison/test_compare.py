@@ -57,7 +57,6 @@ def run(name: str, out: Path, methods: str, store: Path | None = None) -> str:
         out.mkdir()
         shutil.copy(store, out / "mlflow.db")
     with pytest.MonkeyPatch.context() as patched, redirect_stdout(io.StringIO()) as said:
-        patched.delenv("MLFLOW_TRACKING_URI", raising=False)
         patched.setattr("workflows.studies.sweep.run.ray_cluster", nullcontext)
         patched.setattr("workflows.studies.comparison.run.ray_trials", here)
         patched.setattr("workflows.studies.comparison.evaluate.ray_runner", inline)
