@@ -12,9 +12,7 @@ import pytest
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
 
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # else threads of every worker, and of what it starts, wait for each other
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers fill the CPUs; their threads would wait for each other
 hypothesis.settings.register_profile("busy", deadline=None)  # a machine that others use has slow moments
 hypothesis.settings.load_profile("busy")
 _MLFLOW = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")
