@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ Network = Callable[[Tensor, Tensor], Tensor]
 """Logits [b, n] from points [b, n, 3] and poses [b, condition] (:class:`training.networks.template`)."""
 _SHARPNESS = 5.0
 _BARELY = 0.1  # share of its own distance to the surface by which a cell is moved across it
+_SMOOTHED = (0.5, 0.6, 0.7, 0.8, 1.0)  # cells: widths of the Gaussian by which handles are closed
 _AT_ONCE = 2**15  # points whose logits are computed together
 
 
@@ -40,7 +42,7 @@ class Template:
     @property
     def euler_characteristic(self) -> int:
         """Vertices - edges + faces: two for each closed piece without a handle."""
-        return len(self.vertices) - len(edges_of(self.faces.numpy())) + len(self.faces)
+        return _euler_characteristic(self.vertices.numpy(), self.faces.numpy())
 
     def save(self, path: Path) -> None:
         """Write the template as safetensors."""
@@ -110,6 +112,8 @@ def near_surface_iou(network: Network, samples: FrameSamples, condition: Tensor)
 def extract_template(network: Network, condition: Tensor, field: SkinningField, *, cell: float = 0.015) -> Template:
     """The surface where the logit is zero under a pose, within the field's box: closed, a manifold, of one piece.
 
+    Where it has handles, as fingers that touch, the signs of the cells are smoothed by up to a cell until it has none.
+
     Parameters
     ----------
     condition
@@ -130,12 +134,25 @@ def extract_template(network: Network, condition: Tensor, field: SkinningField, 
     outside[1:-1, 1:-1, 1:-1] = -logits[1:-1, 1:-1, 1:-1]
     if not (outside < 0).any():
         raise TrainingError("the template has no surface: nothing is occupied in the field's box. Train for longer")
-    at, faces = surface_nets(one_piece(outside.astype(np.float64)))
+    at, faces = _without_handles(outside.astype(np.float64))
     edge = ((field.high - field.low).numpy() / counts).astype(np.float64)
     vertices = field.low.numpy() + (at + 0.5) * edge
     points = torch.from_numpy(vertices).float()
     normals = torch.from_numpy(vertex_normals(vertices, faces)).float()
     return Template(points, torch.from_numpy(faces), normals, field.weights(points))
+
+
+def _without_handles(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The surface of values [i, j, k], negative inside, smoothed no more than it takes; else as it is."""
+    signs = values.clip(-1, 1)
+    smoothed = (ndimage.gaussian_filter(signs, width) for width in _SMOOTHED)
+    as_it_is = surface_nets(one_piece(values))
+    surfaces = (surface_nets(one_piece(each)) for each in smoothed if (each < 0).any())
+    return next((each for each in chain([as_it_is], surfaces) if _euler_characteristic(*each) == 2), as_it_is)
+
+
+def _euler_characteristic(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> int:
+    return len(vertices) - len(edges_of(faces)) + len(faces)
 
 
 @torch.no_grad()

@@ -87,6 +87,16 @@ def test_the_surface_of_a_ball_without_its_crumb(field: SkinningField) -> None:
     assert torch.equal(made.weights, field.weights(made.vertices))
 
 
+def test_a_hole_of_a_cell_through_a_ball_is_closed(field: SkinningField) -> None:
+    knee = torch.from_numpy(posed_leg().body.joints[1]).float()
+
+    def bored(points: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        away = (points - knee)[..., [0, 2]].norm(dim=-1)
+        return torch.where(away < 0.006, -torch.ones(away.shape), 100 * ball(points, pose))
+
+    assert extract_template(bored, NO_POSE, field, cell=0.01).euler_characteristic == 2
+
+
 def test_finer_cells_give_more_points(field: SkinningField) -> None:
     coarse, fine = (extract_template(ball, NO_POSE, field, cell=cell) for cell in (0.016, 0.008))
     assert 3 < len(fine.vertices) / len(coarse.vertices) < 5
