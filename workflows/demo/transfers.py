@@ -28,6 +28,7 @@ from training.objectives.metrics import recentred_point_mesh_distance
 from workflows.demo.bodies import Figure, garments_of, mesh_of, random_figure, truth_of, walk
 from workflows.demo.poses import PERSON
 from workflows.demo.uploads import FRAME_LIMIT, VERTEX_LIMIT
+from workflows.pretrained import name_of
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
 
@@ -180,7 +181,8 @@ class Transfers:
             warn=warnings.append,
         )  # fmt: skip
         garments = garments_of(asked.target) if isinstance(asked.target, Figure) else None
-        outcome = Outcome(asked, target, [], job.count, work.by or str(self.weights), warnings, garments)
+        by = name_of(self.weights) if self.weights else work.by
+        outcome = Outcome(asked, target, [], job.count, by, warnings, garments)
         figures = _figures(asked)
         require_room(outcome.count, first.mesh, target.mesh)
         stood = _turned(work.axes[1], target.mesh)

@@ -20,3 +20,8 @@ def weights_named(name: str) -> Path:
     """The path of weights that a person names: a path that is there, or the name of some that come with the project."""
     place, own = Path(name), own_weights(name)
     return own if place.name == name and not place.exists() and own.is_dir() else place
+
+
+def name_of(weights: Path) -> str:
+    """What a person calls weights: the name of those that come with the project, else their path."""
+    return weights.name if weights == own_weights(weights.name) else str(weights)
