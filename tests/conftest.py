@@ -1,6 +1,9 @@
 """Shared fixtures: a tiny dataset of the procedural leg, made once a session and copied where a test spoils it."""
 
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers fill the CPUs; their threads would wait for each other
+
 import shutil
 import signal
 from collections.abc import Iterator
@@ -12,7 +15,6 @@ import pytest
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers fill the CPUs; their threads would wait for each other
 hypothesis.settings.register_profile("busy", deadline=None)  # a machine that others use has slow moments
 hypothesis.settings.load_profile("busy")
 _MLFLOW = ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")

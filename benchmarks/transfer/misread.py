@@ -83,7 +83,7 @@ def best_limit(bodies: NDArray[np.float64], others: NDArray[np.float64]) -> str:
     limit, (above, below) = min(mistakes.items(), key=lambda item: sum(item[1]))
     return (
         f"at a limit of {limit:.4g} {above} of {len(bodies)} bodies lie above, {below} of {len(others)} others do not; "
-        f"the next other has {others[others > limit].min():.4g}"
+        f"the next other has {others[others > limit].min(initial=np.inf):.4g}"
     )
 
 

@@ -67,7 +67,7 @@ def main() -> None:
             transfer.rest_error(Mesh(way.turned(each.mesh.vertices), each.mesh.faces))
             for way, each in zip(found, (source, target), strict=True)
         ]
-        words = ", ".join(f"{error:.1f}{'!' if error > MISREAD else ''}" for error in errors)
+        words = ", ".join(f"{error:.1f}{'' if error <= MISREAD else '!'}" for error in errors)
         print(f"| {number} | {source.name} | {target.name} | {words} | {stretched(target.mesh, posed)} |", flush=True)
         upright = [
             NamedMesh(way.turned(mesh.vertices), mesh.faces, name)

@@ -168,9 +168,11 @@ class RemoteObjects(FsspecStore):
     def _unanswered(self, error: Exception) -> StorageError:
         if _is_refused(error):
             return StorageError(
-                f"{self.url} refuses access ({reason_of(error)}). The credentials need to list there, to read, and to "
-                "write where anything is made (S3: s3:ListBucket, s3:GetObject, s3:PutObject, s3:DeleteObject; without "
-                "the first S3 also answers so where an object is missing)"
+                f"{self.url} refuses access ({reason_of(error)}). Check your credentials (for S3: AWS_ACCESS_KEY_ID, "
+                "AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL); they need to list there, to read, and to write where "
+                "anything is made (s3:ListBucket, s3:GetObject, s3:PutObject, s3:DeleteObject; without the first S3 "
+                "also answers so where an object is missing). Then run the same command again: it resumes from what is "
+                "there"
             )
         return StorageError(
             f"{self.url} cannot be reached ({reason_of(error)}). Check its address and your credentials (for S3: "

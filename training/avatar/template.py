@@ -112,7 +112,8 @@ def near_surface_iou(network: Network, samples: FrameSamples, condition: Tensor)
 def extract_template(network: Network, condition: Tensor, field: SkinningField, *, cell: float = 0.015) -> Template:
     """The surface where the logit is zero under a pose, within the field's box: closed, a manifold, of one piece.
 
-    Where it has handles, as fingers that touch, the signs of the cells are smoothed by up to a cell until it has none.
+    Where it has handles, as fingers that touch, the logits, cut off at one, are smoothed by up to a cell until it has
+    none, or left as they are.
 
     Parameters
     ----------
@@ -144,9 +145,9 @@ def extract_template(network: Network, condition: Tensor, field: SkinningField, 
 
 def _without_handles(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """The surface of values [i, j, k], negative inside, smoothed no more than it takes; else as it is."""
-    signs = values.clip(-1, 1)
-    smoothed = (ndimage.gaussian_filter(signs, width) for width in _SMOOTHED)
-    as_it_is = surface_nets(one_piece(values))
+    whole = one_piece(values)
+    smoothed = (ndimage.gaussian_filter(whole.clip(-1, 1), width) for width in _SMOOTHED)
+    as_it_is = surface_nets(whole)
     surfaces = (surface_nets(one_piece(each)) for each in smoothed if (each < 0).any())
     return next((each for each in chain([as_it_is], surfaces) if _euler_characteristic(*each) == 2), as_it_is)
 

@@ -206,11 +206,10 @@ def forget_old_stop(run: Path, ranks: Ranks, *, before: float) -> None:
 @contextlib.contextmanager
 def on_sigterm(told: Callable[[], object]) -> Iterator[None]:
     """Call ``told`` at SIGTERM while the block runs; in a thread, which cannot handle signals, change nothing."""
-    try:
-        before = signal.signal(signal.SIGTERM, lambda *_: told())
-    except ValueError:  # not the main thread; Ray Train runs ranks in one
+    if threading.current_thread() is not threading.main_thread():  # Ray Train runs ranks in one
         yield
         return
+    before = signal.signal(signal.SIGTERM, lambda *_: told())
     try:
         yield
     finally:

@@ -75,7 +75,10 @@ def surfaces_of(network: nn.Module, *, sources: Sequence[Mesh], targets: Sequenc
     if not takes_surfaces(network):
         return {}
     device = next(network.parameters()).device
-    return {"source_surface": _surface(sources).to(device), "target_surface": _surface(targets).to(device)}
+    return {
+        "source_surface": surface_of_meshes(sources).to(device),
+        "target_surface": surface_of_meshes(targets).to(device),
+    }
 
 
 def takes_surfaces(network: nn.Module) -> bool:
@@ -83,7 +86,8 @@ def takes_surfaces(network: nn.Module) -> bool:
     return bool(getattr(network, "takes_surfaces", False))
 
 
-def _surface(meshes: Sequence[Mesh]) -> Surface:
+def surface_of_meshes(meshes: Sequence[Mesh]) -> Surface:
+    """What is near along the surfaces of meshes."""
     return joined([surface_of(mesh.vertices, edges_of(mesh.faces)) for mesh in meshes])
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box
-from training.inference.predict import surfaces_of
+from training.inference.predict import surface_of_meshes
 from training.networks.layers.sampling import Sample, sample
 from training.networks.parts import Parts
 
@@ -144,8 +144,8 @@ def rest_error(network: Parts, mesh: Mesh) -> float:
 def sampled(network: Parts, mesh: Mesh) -> Sample:
     """Return what a network reads of a mesh, in its box, with what is near along the surface."""
     vertices = bounding_box(mesh.vertices).normalise(mesh.vertices).astype(np.float32)[None]
-    surface = surfaces_of(network, sources=[mesh], targets=[mesh])["source_surface"]
-    return sample(torch.from_numpy(vertices).to(next(network.parameters()).device), surface)
+    device = next(network.parameters()).device
+    return sample(torch.from_numpy(vertices).to(device), surface_of_meshes([mesh]).to(device))
 
 
 class _Seen(NamedTuple):

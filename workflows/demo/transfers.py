@@ -119,15 +119,24 @@ class Outcome:
 
 
 class _Remembering(PoseTransfer):
-    """Remembers how meshes stand, which takes longer to find than a pose to give."""
+    """Remembers how meshes stand, which takes longer to find than a pose to give, and how well they are read."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__(network)
         self._found = lru_cache(maxsize=32)(self._find)
+        self._errors = lru_cache(maxsize=32)(self._error)
 
     def standing(self, vertices: Floats) -> Axes | Standing:
         """As found the first time."""
         return self._found(vertices.astype(np.float64).tobytes())
+
+    def rest_error(self, mesh: Mesh) -> float:
+        """As found the first time."""
+        return self._errors(mesh.vertices.astype(np.float64).tobytes(), mesh.faces.astype(np.int64).tobytes())
+
+    def _error(self, vertices: bytes, faces: bytes) -> float:
+        mesh = Mesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3))
+        return super().rest_error(mesh)
 
     def _find(self, vertices: bytes) -> Axes | Standing:
         return super().standing(np.frombuffer(vertices).reshape(-1, 3))

@@ -81,12 +81,8 @@ def announce_times(recipe: DatasetRecipe, trainings: Mapping[str, TrainingRecipe
 
     if recipe.body.expected_vertices is None or on_cluster():
         return
-    alone, now, vertices, grid = (
-        0.0,
-        0.0,
-        round(recipe.body.expected_vertices),
-        recipe.identities.training * recipe.poses.seen,
-    )
+    alone, now = 0.0, 0.0
+    vertices, grid = round(recipe.body.expected_vertices), recipe.identities.training * recipe.poses.seen
     for name, training in trainings.items():
         steps, shown = training.last_step(grid // training.batch), training.augmentation.subset or vertices
         if steps * training.batch * shown < _SOON or _on_gpu(training):

@@ -91,7 +91,7 @@ class TransferWork:
             work._settle_axes(weights)
         if job.project:
             upright = Mesh(work.axes[1].turned(target.mesh.vertices), target.mesh.faces)
-            if work.transfer.rest_error(upright) > MISREAD:
+            if not work.transfer.rest_error(upright) <= MISREAD:
                 warn(f"{job.target} is no body that {job.project} knows: what it takes for parts may be none")
         return work
 

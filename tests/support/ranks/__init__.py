@@ -29,8 +29,8 @@ def free_port() -> int:
 class Forked(ForkServerProcess):
     """``python -m MODULE ARGUMENTS`` begun within milliseconds, as a copy of a process that has imported the libraries.
 
-    The packages of this repository are imported anew in each; environment, signals and status are its own. What it
-    prints goes to the file ``output``.
+    The packages of this repository are imported anew in each; environment, signals and status are its own, but for
+    variables that libraries read as they are imported. What it prints goes to the file ``output``.
     """
 
     def __init__(self, words: Sequence[str], output: Path, **environment: str) -> None:

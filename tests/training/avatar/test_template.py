@@ -97,6 +97,16 @@ def test_a_hole_of_a_cell_through_a_ball_is_closed(field: SkinningField) -> None
     assert extract_template(bored, NO_POSE, field, cell=0.01).euler_characteristic == 2
 
 
+def test_a_handle_that_is_no_cells_touching_stays(field: SkinningField) -> None:
+    knee = torch.from_numpy(posed_leg().body.joints[1]).float()
+
+    def torus(points: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        away = points - knee
+        return 1000 * (0.025 - torch.stack([away[..., [0, 2]].norm(dim=-1) - 0.06, away[..., 1]]).norm(dim=0))
+
+    assert extract_template(torus, NO_POSE, field, cell=0.01).euler_characteristic == 0
+
+
 def test_finer_cells_give_more_points(field: SkinningField) -> None:
     coarse, fine = (extract_template(ball, NO_POSE, field, cell=cell) for cell in (0.016, 0.008))
     assert 3 < len(fine.vertices) / len(coarse.vertices) < 5

@@ -2,6 +2,8 @@
 
 import errno
 import os
+import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from datagen.common.errors import DatasetError, StorageError, TrainingError, Tra
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.engine import trainer
-from training.engine.distributed import STOP_FILE, Ranks, agreed, decided_by_first
+from training.engine.distributed import STOP_FILE, Ranks, agreed, decided_by_first, on_sigterm
 from training.engine.state import Verdict
 from training.engine.tasks.transfer import transfer_task, validation
 from training.engine.trainer import train
@@ -126,3 +128,19 @@ def test_a_best_over_other_triples_is_forgotten() -> None:
     state = Verdict(0.1, 3, False, triples=32).state()
     assert Verdict.resumed(state, triples=32) == Verdict(0.1, 3, False, triples=32)
     assert Verdict.resumed(state, triples=8) == Verdict(triples=8)
+
+
+def test_in_a_thread_sigterm_is_left_alone_and_errors_have_no_other_cause() -> None:
+    before, raised = signal.getsignal(signal.SIGTERM), list[BaseException]()
+
+    def work() -> None:
+        try:
+            with on_sigterm(lambda: None):
+                raise KeyError("its own")
+        except KeyError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert raised[0].__context__ is None and signal.getsignal(signal.SIGTERM) is before

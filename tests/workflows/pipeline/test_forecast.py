@@ -9,6 +9,7 @@ from tests.support.recipes import PARTS, tiny_training
 from training.engine import step_time
 from training.engine.step_time import StepTime, seconds_a_step
 from training.recipes.training import TrainingRecipe
+from training.tracking.provenance import cores
 from workflows.pipeline import forecast
 from workflows.pipeline.forecast import announce_times
 from workflows.recipe.loader import load_recipe
@@ -86,9 +87,12 @@ def test_steps_of_every_kind_are_tried_and_nothing_of_it_stays(
 ) -> None:
     monkeypatch.setattr(step_time, "_SECONDS", 0.0)
     recipe = tiny_training(**changes, edge_weight=0, optimiser=optimiser, batch=2, ranks=2, launcher="ray")
-    before = torch.get_num_threads()
+    before, more = torch.get_num_threads(), cores() + 1
+    torch.set_num_threads(more)
     assert min(seconds_a_step(recipe, vertices=20)) > 0
-    assert torch.get_num_threads() == before
+    after = torch.get_num_threads()
+    torch.set_num_threads(before)
+    assert after == more
 
 
 def test_examples_that_are_too_many_to_try_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

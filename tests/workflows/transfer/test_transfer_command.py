@@ -104,7 +104,9 @@ def test_refining_is_off_unless_asked(transfer: Transfer, tmp_path: Path) -> Non
     assert abs(plain - refined).max() > 1e-4
 
 
-def test_projection_onto_parts_is_an_option(transfer: Transfer, run: Path, tmp_path: Path) -> None:
+def test_projection_onto_parts_is_an_option(
+    transfer: Transfer, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     parts = tmp_path / "parts"
     train(tiny_training(**PARTS, steps=1, edge_weight=0), data=str(run.parent / "leg.zarr"), run=parts)
     transfer("pose.obj", "person.obj", "-o", tmp_path / "a.obj")
@@ -113,6 +115,11 @@ def test_projection_onto_parts_is_an_option(transfer: Transfer, run: Path, tmp_p
     expected = PoseTransfer.from_run(run, project=parts)(source=load_mesh("pose.obj"), target=load_mesh("person.obj"))
     assert np.allclose(projected.vertices, expected.vertices, atol=1e-5)
     assert abs(plain.vertices - projected.vertices).max() > 1e-4
+    for error, is_told in ((0.0, False), (float("nan"), True)):
+        capsys.readouterr()
+        monkeypatch.setattr(PoseTransfer, "rest_error", lambda self, mesh, error=error: error)
+        transfer("pose.obj", "person.obj", "-o", tmp_path / "d.obj", "--project", parts)
+        assert (f"is no body that {parts} knows" in capsys.readouterr().err) == is_told
     with pytest.raises(CheckpointError, match=r"--project humann: there is no such run .* along: animals, anny-quick"):
         transfer("pose.obj", "person.obj", "-o", tmp_path / "c.obj", "--project", "humann")
     options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", "c.obj", "--project", "human"])
