@@ -23,6 +23,7 @@ from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from workflows.pipeline.console import warn
+from workflows.pretrained import name_of
 from workflows.transfer.choice import Load, Pair, chosen, standings
 from workflows.transfer.job import TransferJob
 
@@ -92,7 +93,7 @@ class TransferWork:
         if job.project:
             upright = Mesh(work.axes[1].turned(target.mesh.vertices), target.mesh.faces)
             if not work.transfer.rest_error(upright) <= MISREAD:
-                warn(f"{job.target} is no body that {job.project} knows: what it takes for parts may be none")
+                warn(f"{job.target} is no body that {name_of(job.project)} knows: what it takes for parts may be none")
         return work
 
     def _settle_axes(self, weights: Path) -> None:

@@ -119,7 +119,7 @@ def test_projection_onto_parts_is_an_option(
         capsys.readouterr()
         monkeypatch.setattr(PoseTransfer, "rest_error", lambda self, mesh, error=error: error)
         transfer("pose.obj", "person.obj", "-o", tmp_path / "d.obj", "--project", parts)
-        assert (f"is no body that {parts} knows" in capsys.readouterr().err) == is_told
+        assert (f"person.obj is no body that {parts}" in capsys.readouterr().err) == is_told
     with pytest.raises(CheckpointError, match=r"--project humann: there is no such run .* along: animals, anny-quick"):
         transfer("pose.obj", "person.obj", "-o", tmp_path / "c.obj", "--project", "humann")
     options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", "c.obj", "--project", "human"])
