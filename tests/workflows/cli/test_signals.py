@@ -49,7 +49,7 @@ def test_a_command_that_waits_for_ray_hears_signals_and_is_stopped_with_its_own_
 
 
 STARTING = """
-import os, signal
+import os, signal, time
 import ray
 from workflows.pipeline.console import guarded
 from workflows.pipeline.ray_cluster import ray_cluster
@@ -61,8 +61,11 @@ def connecting(*arguments, **named):
 
 def main():
     ray.init = connecting
-    with ray_cluster():
-        pass
+    try:
+        with ray_cluster():
+            pass
+    finally:
+        time.sleep(4)  # as closing may take; Ray's own handler would abort after three seconds
 
 guarded(main)
 """
