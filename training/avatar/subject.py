@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datagen.common.arrays import Floats
 from datagen.common.errors import CheckpointError
 from datagen.mesh.geometry import Mesh
-from datagen.mesh.rig import world_rotations
+from datagen.mesh.rig import skinned, world_rotations
 from training.avatar.body import CanonicalBody
 from training.checkpoints.weights import read_header, read_weights, write_weights_atomically
 
@@ -29,7 +29,7 @@ class Subject:
     name
         Of the outfit.
     source
-        What the scans are of: the dataset's uuid.
+        Where the scans are from: the dataset's uuid, or the sha256 of the file.
     body
         In the canonical pose.
     scans
@@ -59,6 +59,11 @@ class Subject:
     def scan(self, frame: int) -> Mesh:
         """The mesh of a frame."""
         return Mesh(self.scans[frame].astype(np.float64), self.faces)
+
+    def posed(self, frame: int) -> Mesh:
+        """The body below the clothes, as it stands in a frame."""
+        transforms = self.transforms[frame][None].astype(np.float64)
+        return Mesh(skinned(self.body.vertices, self.body.weights, transforms)[0], self.body.faces)
 
     @property
     def seen(self) -> list[int]:

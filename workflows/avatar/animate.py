@@ -104,7 +104,8 @@ def poses_of(folder: AvatarFolder, file: Path | None, source: Path | None = None
         files = [source] if source.is_file() else frames_of(source)
         meshes = (read_mesh_file(each).mesh for each in bar(files, total=len(files), what="read poses", unit="mesh"))
         return Poses(*read_poses(own_weights("human"), meshes))
-    recipe = load_avatar(str(folder.recipe)).data.poses
+    data = load_avatar(str(folder.recipe)).data
+    recipe = data.poses if data else PoseRecipe()
     drawn = draw_poses(PoseRecipe(distribution=recipe.distribution, seed=recipe.seed + 1 + seed), range(count))
     return Poses(drawn.joints, drawn.parents, _walk(drawn.rotations))
 

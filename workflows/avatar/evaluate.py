@@ -31,7 +31,7 @@ from training.tracking.record import update_record
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 from training.viz.style import error_colors
 from workflows.avatar.outfits import draped_finer, is_draped, outer_scan, wearers
-from workflows.avatar.recipe import AvatarEvaluation
+from workflows.avatar.recipe import AvatarEvaluation, AvatarWorkflow
 from workflows.avatar.runs import trained
 from workflows.pipeline.progress import bar
 from workflows.pipeline.run_folder import AvatarFolder
@@ -64,12 +64,14 @@ class Measured:
     parts: Mapping[int, Mapping[str, float]]
 
 
-def evaluate_avatar(recipe: AvatarEvaluation, folder: AvatarFolder) -> None:
+def evaluate_avatar(given: AvatarWorkflow, folder: AvatarFolder) -> None:
     """Measure and draw an avatar that was learned, and record it: tables.md, rows.csv, figures/examples.png."""
-    out, parameters = folder.evaluation, recipe.model_dump(mode="json")
+    recipe, out = given.evaluation, folder.evaluation
+    parameters = recipe.model_dump(mode="json")
     with recorded(out.path, kind="evaluate", name="evaluate", parent=folder.path, parameters=parameters):
         wardrobe, network = learned_avatar(folder)
-        rows = list(_measured(recipe, wardrobe, network, open_dataset(folder.data)))
+        dataset = open_dataset(folder.data) if given.data else None
+        rows = list(_measured(recipe, wardrobe, network, dataset))
         write_atomically(out.rows, _csv(rows).encode())
         _draw(recipe, wardrobe, network, out.examples)
         write_atomically(out.tables, markdown(rows).encode())
@@ -104,7 +106,9 @@ def learned_avatar(folder: AvatarFolder) -> tuple[Wardrobe, nn.Module]:
     return wardrobe, trained(recipe, folder.outfits, folder.run, section="avatar")
 
 
-def _measured(recipe: AvatarEvaluation, wardrobe: Wardrobe, network: nn.Module, dataset: Dataset) -> Iterator[Measured]:
+def _measured(
+    recipe: AvatarEvaluation, wardrobe: Wardrobe, network: nn.Module, dataset: Dataset | None
+) -> Iterator[Measured]:
     frames = {
         (number, kind): list(getattr(subject, kind))[: recipe.frames]
         for number, subject in enumerate(wardrobe.subjects)
@@ -121,7 +125,7 @@ def _measured(recipe: AvatarEvaluation, wardrobe: Wardrobe, network: nn.Module, 
             for frame in its:
                 scan = outer_scan(subject, frame)
                 meshes = _methods(wardrobe, network, number, frame, usual[number])
-                if kind == "unseen" and is_draped(dataset):
+                if dataset and kind == "unseen" and is_draped(dataset):
                     meshes[_FLOOR], footprints[_FLOOR] = _draped_again(dataset, subject, frame, scan)
                 for method, (mesh, normals) in meshes.items():
                     found = score(mesh, normals, scan, samples=recipe.samples, parts=subject.parts)
@@ -231,9 +235,13 @@ def markdown(rows: list[Measured]) -> str:
         "",
         "Means over poses. Millimetres, but normals in degrees; Chamfer and cosine as FITE's released "
         "code defines them (half sums, over the diagonal of the box). Corresponding: how far points are from the "
-        "places on the cloth that they lie on in the plainest seen pose. The last row of unseen poses is the "
-        "simulation's own error: the same poses draped by twice as many stations and steps.",
+        "places on the cloth that they lie on in the plainest seen pose.",
     ]
+    if any(row.method == _FLOOR for row in rows):
+        lines[-1] += (
+            " The last row of unseen poses is the simulation's own error: the same poses draped by twice as many "
+            "stations and steps."
+        )
     for outfit in dict.fromkeys(row.outfit for row in rows):
         own = [row for row in rows if row.outfit == outfit]
         lines += ["", f"## {outfit}", "", *_head(["poses", "method"], list(COLUMNS.values()))]

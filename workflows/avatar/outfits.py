@@ -1,4 +1,4 @@
-"""From a dataset of dressed people to the folders of outfits: body, scans, field, points around and on the scans."""
+"""From a dataset of dressed people, or files of scans, to the folders of outfits: body, scans, field, points."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from datagen.bodies import load_body
 from datagen.bodies.clothed.model import ClothedModel
-from datagen.common.errors import CheckpointError, UnsafeFileError
+from datagen.common.errors import CheckpointError, RecipeError, UnsafeFileError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh
-from datagen.mesh.rig import skinned
 from datagen.poses import Poses
 from datagen.recipe import ClothedBody
-from datagen.store import Dataset
+from datagen.store import Dataset, open_dataset
 from training.avatar.body import canonical_body
 from training.avatar.diffusion import SkinningField, diffused_skinning
 from training.avatar.occupancy import HIDDEN_DEPTH, FrameSamples, frame_samples, hand_samples, surface_points
@@ -26,8 +25,10 @@ from training.avatar.solid import Solid
 from training.avatar.subject import Subject, posed_by
 from training.avatar.template import pose_condition
 from training.checkpoints.weights import read_header
+from workflows.avatar.person_file import person_source, read_person
 from workflows.avatar.recipe import AvatarWorkflow, FieldRecipe, ScanRecipe
 from workflows.pipeline.progress import bar
+from workflows.pipeline.run_folder import AvatarFolder
 from workflows.pipeline.tasks import TaskRunner
 
 MADE = ("subject", "field", "samples", "surfaces")
@@ -35,11 +36,11 @@ MADE = ("subject", "field", "samples", "surfaces")
 _HAND_POINTS = 5_000
 
 
-def make_outfits(recipe: AvatarWorkflow, dataset: Dataset, folder: Path, tasks: TaskRunner) -> None:
+def make_outfits(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner) -> None:
     """Make the folders of all outfits; a file that is there already was finished, and is kept."""
-    for subject in subjects_of(dataset):
-        outfit = Outfit(folder / subject.name)
-        if not is_of(outfit, dataset.uuid):
+    for subject in _subjects(recipe, folder):
+        outfit = Outfit(folder.outfits / subject.name)
+        if not is_of(outfit, subject.source):
             for name in MADE:
                 getattr(outfit, name).path.unlink(missing_ok=True)
             subject.save(outfit.subject.path)
@@ -49,8 +50,30 @@ def make_outfits(recipe: AvatarWorkflow, dataset: Dataset, folder: Path, tasks: 
             _draw(recipe.scans, outfit, subject, tasks)
 
 
+def sources(recipe: AvatarWorkflow, folder: AvatarFolder) -> dict[str, str]:
+    """The outfits of a recipe by name, and where the scans of each are from (:class:`Subject`)."""
+    if recipe.people:
+        return {path.stem: person_source(path) for path in map(Path, recipe.people)}
+    dataset = open_dataset(folder.data)
+    return dict.fromkeys(wearers(dataset), dataset.uuid)
+
+
+def _subjects(recipe: AvatarWorkflow, folder: AvatarFolder) -> Iterator[Subject]:
+    if not recipe.people:
+        yield from subjects_of(open_dataset(folder.data))
+        return
+    files = bar(recipe.people, total=len(recipe.people), what="read scans", unit="file")
+    found = [read_person(Path(path)) for path in files]
+    for path, subject in zip(recipe.people, found, strict=True):
+        if subject.body.names != found[0].body.names:
+            raise RecipeError(
+                f"{path} has other joints than {recipe.people[0]}: people that are learned together have the same ones"
+            )
+    yield from found
+
+
 def is_of(outfit: Outfit, source: str) -> bool:
-    """Whether an outfit's scans are there, whole, and those of a dataset."""
+    """Whether an outfit's scans are there, whole, and from a source."""
     try:
         return bool(read_header(outfit.subject.path).get("source") == source)
     except (CheckpointError, UnsafeFileError):
@@ -162,10 +185,8 @@ def draw_frame(place: str, frame: int, around: int, surface: int) -> tuple[Frame
 
 def solid_parts(subject: Subject, frame: int) -> list[Mesh]:
     """A scan as the posed body and the parts of the outfit, each a mesh of its own."""
-    body, transforms = subject.body, subject.transforms[frame][None].astype(np.float64)
-    posed = Mesh(skinned(body.vertices, body.weights, transforms)[0], body.faces)
     garments = [_part(subject, frame, part) for part in range(1, int(subject.parts.max()) + 1)]
-    return [posed, *garments]
+    return [subject.posed(frame), *garments]
 
 
 def _part(subject: Subject, frame: int, part: int) -> Mesh:

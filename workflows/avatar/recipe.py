@@ -44,7 +44,12 @@ class AvatarWorkflow(Frozen):
     """Everything that ``dsffnet avatar train`` does."""
 
     description: str = Field("", description="one line for people")
-    data: DatasetRecipe = Field(description="scans: people of family clothed; those of the evaluation split are taken")
+    data: DatasetRecipe | None = Field(
+        None, description="scans: people of family clothed; those of the evaluation split are taken"
+    )
+    people: tuple[str, ...] = Field(
+        (), description="in the place of data: files of one's own scans, one a person in an outfit (docs/avatar.md)"
+    )
     field: FieldRecipe = Field(default_factory=FieldRecipe)
     scans: ScanRecipe = Field(default_factory=ScanRecipe)
     template: TrainingRecipe = Field(description="of each outfit's implicit template")
@@ -54,12 +59,14 @@ class AvatarWorkflow(Frozen):
 
     @model_validator(mode="after")
     def _can_be_learned(self) -> Self:
-        if not isinstance(self.data.body, ClothedBody):
+        if self.data is None or self.people:
+            self._require_people()
+        elif not isinstance(self.data.body, ClothedBody):
             raise ValueError(
                 f"data.body.family: an avatar is learned of dressed people, not of {self.data.body.family!r}; use "
                 "clothed"
             )
-        if self.data.identities.evaluation == 0:
+        elif self.data.identities.evaluation == 0:
             raise ValueError(
                 "data.identities.evaluation is 0, but these are the people who become avatars: set it to 1 or more"
             )
@@ -71,14 +78,26 @@ class AvatarWorkflow(Frozen):
                 raise ValueError(f"{section}.network: need {section!r}, not {training.network.name!r}")
         return self
 
+    def _require_people(self) -> None:
+        if (self.data is None) != bool(self.people):
+            raise ValueError("data, people: need one of the two, scans that are made or files of one's own")
+        names = [Path(path).stem for path in self.people]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"people: two files are called {twice[0]!r}, which is the name of the outfit; rename one")
+
 
 def known_avatars() -> dict[str, Path]:
     """Avatars' recipes that come with the project, by name."""
     return known_files("avatars")
 
 
-def load_avatar(name_or_file: str, overrides: Sequence[str] = ()) -> AvatarWorkflow:
+def load_avatar(
+    name_or_file: str, overrides: Sequence[str] = (), *, people: Sequence[str | Path] = ()
+) -> AvatarWorkflow:
     """Read a recipe by name or file, apply overrides ``section.key=value``, and check all of it.
+
+    ``people``: files of scans that take the place of the recipe's data.
 
     Raises
     ------
@@ -91,5 +110,7 @@ def load_avatar(name_or_file: str, overrides: Sequence[str] = ()) -> AvatarWorkf
     if not isinstance(values, dict):
         raise RecipeError(f"recipe {name_or_file} is not a mapping of sections (data, field, scans, template, avatar)")
     values = with_absolute_paths(changed(values, parse_words(overrides, option="--set ")), path.resolve().parent)
+    if people:
+        values = {**values, "data": None, "people": [str(Path(path).expanduser().resolve()) for path in people]}
     with recipe_faults(name_or_file, keys="dsffnet avatar train --help-all"):
         return AvatarWorkflow.model_validate(values)

@@ -3,13 +3,12 @@
 from contextlib import ExitStack
 from pathlib import Path
 
-from datagen.common.errors import CheckpointError, RecipeError
-from datagen.store import open_dataset
-from training.avatar.outfit import outfits_in
+from datagen.common.errors import RecipeError
+from training.avatar.outfit import Outfit, outfits_in
 from training.avatar.template import extract_template, plainest_pose
 from training.tracking.record import has_record
 from workflows.avatar.evaluate import evaluate_avatar
-from workflows.avatar.outfits import MADE, is_of, make_outfits
+from workflows.avatar.outfits import MADE, is_of, make_outfits, sources
 from workflows.avatar.recipe import AvatarWorkflow, load_avatar
 from workflows.avatar.runs import is_learned, learn, trained
 from workflows.pipeline.generate import generate_stage
@@ -21,19 +20,20 @@ from workflows.pipeline.tasks import TaskRunner
 def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
     """All stages of a recipe into the folder ``out``."""
     folder, values = AvatarFolder(out), recipe.model_dump(mode="json")
-    of_outfits = [values[name] for name in ("data", "field", "scans")]
+    of_outfits = [values["data"] or sources(recipe, folder), values["field"], values["scans"]]
     of_templates = [*of_outfits, values["template"], values["cell"]]
     of_points = [*of_templates, values["avatar"]]
     _refuse_conflicts(recipe, folder)
     with ExitStack() as around:
         begin = once(lambda: begin_workflow(around, recipe, folder, tasks))
+        made = [generate_stage(recipe.data, folder, tasks)] if recipe.data else []
         stages = (
-            generate_stage(recipe.data, folder, tasks),
+            *made,
             Stage(
                 "outfits",
                 depends_on=of_outfits,
                 intact=lambda: _are_sound(recipe, folder, *MADE),
-                work=lambda: make_outfits(recipe, open_dataset(folder.data), folder.outfits, tasks),
+                work=lambda: make_outfits(recipe, folder, tasks),
             ),
             Stage(
                 "templates",
@@ -51,7 +51,7 @@ def run_avatar(recipe: AvatarWorkflow, out: Path, tasks: TaskRunner) -> None:
                 "evaluate",
                 depends_on=[*of_points, values["evaluation"]],
                 intact=lambda: folder.evaluation.tables.exists() and has_record(folder.evaluation.path),
-                work=lambda: evaluate_avatar(recipe.evaluation, folder),
+                work=lambda: evaluate_avatar(recipe, folder),
             ),
         )
         for stage in stages:
@@ -69,7 +69,8 @@ def _refuse_conflicts(recipe: AvatarWorkflow, folder: AvatarFolder) -> None:
     if not folder.recipe.exists():
         return
     there = load_avatar(str(folder.recipe))
-    changed = [name for name in ("data", "field", "scans", "cell") if getattr(recipe, name) != getattr(there, name)]
+    made = ("data", "people", "field", "scans", "cell")
+    changed = [name for name in made if getattr(recipe, name) != getattr(there, name)]
     if changed:
         raise RecipeError(
             f"{folder.path} was made by another recipe: {', '.join(changed)} differ. Choose another --out, or add "
@@ -80,13 +81,8 @@ def _refuse_conflicts(recipe: AvatarWorkflow, folder: AvatarFolder) -> None:
 
 
 def _are_sound(recipe: AvatarWorkflow, folder: AvatarFolder, *files: str) -> bool:
-    try:
-        outfits = outfits_in(folder.outfits)
-    except CheckpointError:
-        return False
-    source = open_dataset(folder.data).uuid
-    whole = all(is_of(its, source) and getattr(its, file).is_sound for its in outfits for file in files)
-    return whole and len(outfits) == recipe.data.identities.evaluation
+    outfits = {Outfit(folder.outfits / name): source for name, source in sources(recipe, folder).items()}
+    return all(is_of(its, source) and getattr(its, file).is_sound for its, source in outfits.items() for file in files)
 
 
 def _learn_templates(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner) -> None:

@@ -28,6 +28,10 @@ def _train_options(made: Parser) -> None:
 
     names = ", ".join(known_avatars())
     made.add_argument("--recipe", default="avatar-small", metavar="NAME|FILE", help=f"a YAML file, or one of {names}")
+    made.add_argument(
+        "--people", nargs="+", default=[], metavar="FILE.npz",
+        help="scans of your own, a file a person in an outfit (docs/avatar.md), in the place of the recipe's data",
+    )  # fmt: skip
     add_set_option(made)
     made.add_argument("--out", metavar="DIR", help="folder for everything (default runs/RECIPE)")
     add_tracking_option(made)
@@ -79,6 +83,7 @@ def avatar_command(options: argparse.Namespace) -> None:
 
     examples:
       dsffnet avatar train --recipe avatar-small --out runs/avatar
+      dsffnet avatar train --people ann.npz --out runs/ann
       dsffnet avatar animate runs/avatar --outfit skirt -o walk.glb --picture walk.png
       dsffnet avatar animate runs/avatar --outfit skirt -o like.glb --source person.obj
       dsffnet avatar evaluate runs/avatar --frames 16
@@ -95,7 +100,7 @@ def _train(options: argparse.Namespace) -> None:
     from workflows.pipeline.run_folder import AvatarFolder
     from workflows.pipeline.tasks import TaskRunner
 
-    recipe = load_avatar(options.recipe, options.set)
+    recipe = load_avatar(options.recipe, options.set, people=options.people)
     out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
     folder = AvatarFolder(out)
     folder.require_kind()
@@ -121,7 +126,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     with folder.alone():
         if changes:
             mark_of(folder.path, "evaluate").unlink(missing_ok=True)
-        evaluate_avatar(load_avatar(str(folder.recipe), changes).evaluation, folder)
+        evaluate_avatar(load_avatar(str(folder.recipe), changes), folder)
     print_text(folder.evaluation.tables.read_text(encoding="utf-8"))
 
 

@@ -130,17 +130,18 @@ def server_of_record(root: Path, uri: str | None) -> Server:
 
 @contextmanager
 def at_work(
-    options: argparse.Namespace, folder: "WorkflowFolder", data: "DatasetRecipe", *, local: bool = False
+    options: argparse.Namespace, folder: "WorkflowFolder", data: "DatasetRecipe | None", *, local: bool = False
 ) -> Iterator[Server]:
     """Hold a workflow's folder, started over where ``--fresh`` is given, and mirror it to MLflow while the block runs.
 
-    What its data take is said before; ``local``: they are made in this process.
+    What its data take, where any are made, is said before; ``local``: they are made in this process.
     """
     from training.tracking.mlflow_mirror import Mirror
     from workflows.pipeline.forecast import announce_size
 
     server = server_of(folder.path, options.tracking_uri)
-    announce_size(data, folder.data, anew=options.fresh, yes=options.yes, local=local)
+    if data is not None:
+        announce_size(data, folder.data, anew=options.fresh, yes=options.yes, local=local)
     with folder.alone():
         if options.fresh:
             folder.remove()

@@ -4,8 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
+from datagen.bodies import load_body
 from datagen.mesh.geometry import Mesh, vertex_normals
+from datagen.mesh.rig import rest_vertices
+from datagen.poses import JOINTS
+from datagen.recipe import LegBody
 from tests.support.shapes.canonical import posed_leg
 from training.avatar.diffusion import diffused_skinning
 from training.avatar.occupancy import FrameSamples, frame_samples, surface_points
@@ -31,6 +36,34 @@ def stockinged() -> Subject:
         rotations=leg.poses.rotations.astype(np.float32),
         is_seen=np.array([True, True, True, False]),
     )
+
+
+def person_arrays() -> dict[str, np.ndarray]:
+    """The arrays of a file of scans: the stockinged leg over SMPL's joints, as a person walks about."""
+    model, parameters, leg = load_body(LegBody(rings=32, segments=12)), np.array([0.9, 0.1, 0.05, 0.5]), posed_leg()
+    rig, subject = model.rig(parameters, JOINTS), stockinged()
+    assert rig is not None
+    weights, places = np.zeros((len(rig.weights), len(JOINTS))), np.zeros((len(JOINTS), 3))
+    for part, driver in enumerate(rig.drivers):
+        weights[:, driver] += rig.weights[:, part]
+        places[driver] = rig.joints[part]
+    random = np.random.default_rng(0)
+    poses = leg.poses.rotations.copy()
+    poses[:, 0] = random.normal(0, 1, (len(poses), 3))
+    moves = random.normal(0, 1, (len(poses), 3))
+    turned = Rotation.from_rotvec(poses[:, 0]).as_matrix()
+    scans = (subject.scans - places[0]) @ turned.transpose(0, 2, 1) + places[0] + moves[:, None]
+    return {
+        "scans": scans,
+        "faces": subject.faces,
+        "poses": poses,
+        "joints": np.array(JOINTS),
+        "translations": moves,
+        "body_vertices": rest_vertices(leg.posed, rig.weights, rig.transforms(leg.poses.world())),
+        "body_faces": leg.body.faces,
+        "body_weights": weights,
+        "body_joints": places,
+    }
 
 
 def drawn_outfit(folder: Path, *, with_template: bool = True) -> Outfit:

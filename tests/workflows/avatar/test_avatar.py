@@ -18,10 +18,10 @@ from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.poses.pose_files import write_pose_file
 from datagen.recipe import AnnyBody, ClothedBody, PoseRecipe
 from tests.support.commands import command
-from tests.support.shapes.outfits import drawn_outfit, stockinged
+from tests.support.shapes.outfits import drawn_outfit, person_arrays, stockinged
 from workflows.avatar.animate import poses_of
 from workflows.avatar.evaluate import Measured, markdown
-from workflows.avatar.outfits import is_draped, is_of, outer_scan, wearers
+from workflows.avatar.outfits import is_draped, is_of, make_outfits, outer_scan, wearers
 from workflows.avatar.recipe import known_avatars, load_avatar
 from workflows.avatar.run import run_avatar
 from workflows.pipeline.run_folder import AvatarFolder
@@ -235,6 +235,49 @@ def test_from_scans_to_an_animation(recipe: Path, tmp_path: Path) -> None:
     assert nobody.returncode != 0 and "no mesh file or folder at" in nobody.stderr
     wrong = command("avatar", "animate", str(out), "--outfit", "coat", "-o", str(tmp_path / "walk.glb"))
     assert wrong.returncode != 0 and "has the outfits skirt: there is no outfit 'coat' in it" in wrong.stderr
+
+
+def test_from_scans_of_ones_own_to_an_animation(recipe: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "ann.npz", **person_arrays())
+    out = tmp_path / "run"
+    words = ["avatar", "train", "--recipe", str(recipe), "--people", str(tmp_path / "ann.npz"), "--out", str(out)]
+    words += ["--local", "--set", "field.centres=80", "field.spacing=0.08"]
+    done = command(*words)
+    assert done.returncode == 0, done.stderr
+    assert "## ann" in done.stdout and "| unseen | avatar |" in done.stdout
+    assert "simulation" not in done.stdout and "generate" not in done.stdout, "nothing was made"
+    again = command(*words)
+    assert all(f"{stage}: skipped" in again.stdout for stage in ("outfits", "templates", "avatar", "evaluate"))
+    walk = command("avatar", "animate", str(out), "-o", str(tmp_path / "walk.glb"), "--stations", "2")
+    assert walk.returncode == 0 and (tmp_path / "walk.glb").stat().st_size > 1000, walk.stderr
+    other = command(*words[:-4], "--set", "field.centres=80", "field.spacing=0.08", "cell=0.05")
+    assert other.returncode != 0 and "was made by another recipe: cell differ" in other.stderr
+    missing = command(*words[:5], str(tmp_path / "nobody.npz"), "--out", str(tmp_path / "other"), "--local")
+    assert missing.returncode != 0 and "no file of scans at" in missing.stderr, missing.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"data": None}, r"need one of the two, scans that are made or files of one's own"),
+        ({"people": ["ann.npz"]}, r"need one of the two"),
+        ({"data": None, "people": ["a/ann.npz", "b/ann.npz"]}, r"two files are called 'ann'"),
+    ],
+)
+def test_scans_are_made_or_ones_own(change: dict[str, Any], said: str, recipe: Path) -> None:
+    recipe.write_text(yaml.safe_dump(TINY | change))
+    with pytest.raises(RecipeError, match=said):
+        load_avatar(str(recipe))
+
+
+def test_people_learned_together_have_the_same_joints(recipe: Path, tmp_path: Path) -> None:
+    arrays = person_arrays()
+    np.savez(tmp_path / "ann.npz", **arrays)
+    np.savez(tmp_path / "ben.npz", **{**arrays, "joints": np.array([f"bone {n}" for n in range(len(JOINTS))]),
+                                      "parents": np.array(PARENTS)})  # fmt: skip
+    given = load_avatar(str(recipe), people=[tmp_path / "ann.npz", tmp_path / "ben.npz"])
+    with pytest.raises(RecipeError, match=r"ben.npz has other joints than .*ann.npz"):
+        make_outfits(given, AvatarFolder(tmp_path / "run"), TaskRunner(local=True))
 
 
 def _person(path: Path) -> Path:
