@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from workflows.pipeline.run_folder import WorkflowFolder
 
 log = logging.getLogger(__name__)
+_SPINS = "20000"
+"""Rounds that a waiting thread of torch's (libgomp) stays awake; its own choice is 300,000."""
 _LESS = "lower counts, vertices, training.batch or widths"
 
 
@@ -34,6 +36,7 @@ def guarded(main: Callable[[], None]) -> None:
     129: the terminal was closed.
     """
     _prepare_output()
+    _let_others_work()
     told = _heed_signals()
     try:
         _require_text(sys.argv[1:])
@@ -65,6 +68,15 @@ def _prepare_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def _let_others_work() -> None:
+    """Let torch's threads that wait for each other fall asleep soon: awake, they hold the cores that others need.
+
+    Read when torch is imported, here or in a child.
+    """
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
 
 
 def _heed_signals() -> list[int]:

@@ -1,6 +1,7 @@
 """Commands say what a dataset takes before they make it, and refuse in one line what there is no room for."""
 
 import io
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -205,3 +206,18 @@ def test_a_name_that_is_no_text_at_all_is_one_line(capsys: Printed) -> None:
         "caf\udce9".encode()
 
     refused(lambda: guarded(no_text), 1, r"'caf\udce9' is not UTF-8 text", capsys)
+
+
+def test_waiting_threads_fall_asleep_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    guarded(lambda: None)
+    assert "GOMP_SPINCOUNT" not in os.environ
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    guarded(lambda: None)
+    assert os.environ["GOMP_SPINCOUNT"] == "20000"
+    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
+    guarded(lambda: None)
+    assert os.environ["GOMP_SPINCOUNT"] == "7"
