@@ -23,7 +23,8 @@ _LICENCE = "as the file's owner states"
 _LARGEST_ANGLE = 1e6  # radians; sines of numbers far beyond are not finite
 _ARRAYS = ("poses", "joints", "parents")
 _MOST_JOINTS = 10_000
-_MAKE_ONE = "datagen.poses.pose_files.write_pose_file makes one"
+MAKE_ONE = "datagen.poses.pose_files.write_pose_file makes one"
+"""How errors end."""
 
 
 class FoundSource:
@@ -96,7 +97,7 @@ def read_pose_file(path: str | Path) -> Poses:
     arrays = _arrays(Path(path))
     for name in ("poses", "joints"):
         if name not in arrays:
-            raise RecipeError(f"{path} has no array {name!r}; it has {', '.join(arrays) or 'none'}. {_MAKE_ONE}")
+            raise RecipeError(f"{path} has no array {name!r}; it has {', '.join(arrays) or 'none'}. {MAKE_ONE}")
     joints = _names(path, arrays["joints"])
     return Poses(joints, _parents(path, joints, arrays.get("parents")), _rotations(path, arrays["poses"], len(joints)))
 
@@ -111,19 +112,19 @@ def write_pose_file(path: str | Path, poses: Poses) -> None:
 def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     if not path.is_file():
         raise RecipeError(
-            f"no pose file at {str(path)!r}. Name it: --set data.poses.distribution.path=FILE.npz; {_MAKE_ONE}"
+            f"no pose file at {str(path)!r}. Name it: --set data.poses.distribution.path=FILE.npz; {MAKE_ONE}"
         )
     try:
         return read_arrays(path, _ARRAYS)
     except FAULTS as error:
-        raise RecipeError(f"{path} is no .npz file of plain arrays ({reason_of(error)}). {_MAKE_ONE}") from error
+        raise RecipeError(f"{path} is no .npz file of plain arrays ({reason_of(error)}). {MAKE_ONE}") from error
 
 
 def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDArray[np.float64]:
     if poses.ndim != 3 or poses.shape[1:] != (joints, 3) or poses.dtype.kind not in "fiu":
         raise RecipeError(
             f"{path}: `poses` has shape {poses.shape} and type {poses.dtype}; with {joints} joints it must be numbers "
-            f"[pose, {joints}, 3]. {_MAKE_ONE}"
+            f"[pose, {joints}, 3]. {MAKE_ONE}"
         )
     rotations = poses.astype(np.float64)
     wrong = np.flatnonzero(~(np.abs(rotations) <= _LARGEST_ANGLE).all(axis=(1, 2)))
@@ -138,10 +139,10 @@ def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDA
 def _names(path: str | Path, joints: NDArray[np.generic]) -> tuple[str, ...]:
     if joints.ndim > 1 or joints.dtype.kind != "U":
         raise RecipeError(
-            f"{path}: `joints` has shape {joints.shape} and type {joints.dtype}; it must be names [joint]. {_MAKE_ONE}"
+            f"{path}: `joints` has shape {joints.shape} and type {joints.dtype}; it must be names [joint]. {MAKE_ONE}"
         )
     if joints.size > _MOST_JOINTS:
-        raise RecipeError(f"{path}: `joints` has {joints.size:,} names, at most {_MOST_JOINTS:,} are read. {_MAKE_ONE}")
+        raise RecipeError(f"{path}: `joints` has {joints.size:,} names, at most {_MOST_JOINTS:,} are read. {MAKE_ONE}")
     return tuple(str(joint) for joint in np.atleast_1d(joints))
 
 
@@ -149,7 +150,7 @@ def _numbers(path: str | Path, parents: NDArray[np.generic]) -> tuple[int, ...]:
     if parents.ndim > 1 or parents.dtype.kind not in "iu":
         raise RecipeError(
             f"{path}: `parents` has shape {parents.shape} and type {parents.dtype}; it must be whole numbers [joint]. "
-            f"{_MAKE_ONE}"
+            f"{MAKE_ONE}"
         )
     return tuple(int(parent) for parent in np.atleast_1d(parents))
 
@@ -157,21 +158,21 @@ def _numbers(path: str | Path, parents: NDArray[np.generic]) -> tuple[int, ...]:
 def _parents(path: str | Path, joints: Sequence[str], given: NDArray[np.generic] | None) -> tuple[int, ...]:
     repeated = sorted({joint for joint in joints if joints.count(joint) > 1})
     if repeated:
-        raise RecipeError(f"{path}: `joints` names {repeated[0]!r} twice. {_MAKE_ONE}")
+        raise RecipeError(f"{path}: `joints` names {repeated[0]!r} twice. {MAKE_ONE}")
     parents = _known_parents(joints) if given is None else _numbers(path, given)
     if parents is None:
         strange = next(joint for joint in joints if joint not in JOINTS)
         raise RecipeError(
             f"{path} has no `parents`, and its joints are neither SMPL's nor SMAL's ({strange!r}). Add the parents: "
-            f"{_MAKE_ONE}"
+            f"{MAKE_ONE}"
         )
     if len(parents) != len(joints):
-        raise RecipeError(f"{path}: {len(parents)} parents for {len(joints)} joints. {_MAKE_ONE}")
+        raise RecipeError(f"{path}: {len(parents)} parents for {len(joints)} joints. {MAKE_ONE}")
     for joint, parent in enumerate(parents):
         if not -1 <= parent < joint:
             raise RecipeError(
                 f"{path}: joint {joint} ({joints[joint]!r}) has parent {parent}; parents come before their children, "
-                f"and a root's is -1. {_MAKE_ONE}"
+                f"and a root's is -1. {MAKE_ONE}"
             )
     return parents
 

@@ -62,6 +62,12 @@ def animate(
     wardrobe, network = learned_avatar(folder)
     number = _number([subject.name for subject in wardrobe.subjects], outfit, folder)
     subject, faces = wardrobe.subjects[number], wardrobe.templates[number].faces.numpy()
+    driven = [name for name in subject.body.drivers if name]
+    if not set(driven) & set(poses.joints):
+        raise RecipeError(
+            f"the poses turn {', '.join(poses.joints[:3])}, ..., none of which {subject.name} has "
+            f"({', '.join(driven[:3])}, ...). Give poses over its joints: --poses FILE.npz"
+        )
     transforms = posed_by(subject.body, poses.rotations, poses.joints, poses.parents)
     kept = set(np.linspace(0, len(poses) - 1, _SHOWN).astype(int).tolist())
     shown = list[NDArray[np.float64]]()

@@ -53,7 +53,7 @@ def make_outfits(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner
 def sources(recipe: AvatarWorkflow, folder: AvatarFolder) -> dict[str, str]:
     """The outfits of a recipe by name, and where the scans of each are from (:class:`Subject`)."""
     if recipe.people:
-        return {path.stem: person_source(path) for path in map(Path, recipe.people)}
+        return {path.stem: _source(path, Outfit(folder.outfits / path.stem)) for path in map(Path, recipe.people)}
     dataset = open_dataset(folder.data)
     return dict.fromkeys(wearers(dataset), dataset.uuid)
 
@@ -62,22 +62,60 @@ def _subjects(recipe: AvatarWorkflow, folder: AvatarFolder) -> Iterator[Subject]
     if not recipe.people:
         yield from subjects_of(open_dataset(folder.data))
         return
-    files = bar(recipe.people, total=len(recipe.people), what="read scans", unit="file")
-    found = [read_person(Path(path)) for path in files]
-    for path, subject in zip(recipe.people, found, strict=True):
-        if subject.body.names != found[0].body.names:
+    for path in bar([Path(its) for its in recipe.people], total=len(recipe.people), what="read scans", unit="file"):
+        outfit = Outfit(folder.outfits / path.stem)
+        yield outfit.subject.load() if is_of(outfit, _source(path, outfit)) else read_person(path)
+
+
+def require_people(recipe: AvatarWorkflow, folder: AvatarFolder, *, fresh: bool) -> None:
+    """Refuse files of scans that cannot be learned from, before anything is made, or removed for a ``fresh`` start.
+
+    Raises
+    ------
+    RecipeError
+        A file is missing, is no such file, has other joints than the first, too few scans, or is not the one that the
+        folder's outfit was made of.
+    """
+    joints: list[Sequence[str]] = []
+    for path in map(Path, recipe.people):
+        outfit = Outfit(folder.outfits / path.stem)
+        kept = None if fresh else _header(outfit)
+        if kept and kept["source"] != _source(path, outfit):
+            raise RecipeError(
+                f"{path} is not the file that {outfit.path} was made of. Put that one back, choose another --out, or "
+                "add --fresh to start over"
+            )
+        subject = None if kept else read_person(path)
+        joints.append(tuple(kept["bones"]["names"]) if kept else subject.body.names if subject else ())
+        if joints[-1] != joints[0]:
             raise RecipeError(
                 f"{path} has other joints than {recipe.people[0]}: people that are learned together have the same ones"
             )
-    yield from found
+        if subject and len(subject.seen) < recipe.template.batch:
+            raise RecipeError(
+                f"{path} has {len(subject.seen)} scans to learn from, fewer than template.batch, "
+                f"{recipe.template.batch}. Lower that by --set template.batch={len(subject.seen)}"
+            )
+
+
+def _source(path: Path, outfit: Outfit) -> str:
+    """What a file of scans is known by; of one that is gone, as the outfit that was made of it says."""
+    kept = None if path.is_file() else _header(outfit)
+    return kept["source"] if kept else person_source(path)
 
 
 def is_of(outfit: Outfit, source: str) -> bool:
     """Whether an outfit's scans are there, whole, and from a source."""
+    kept = _header(outfit)
+    return kept is not None and bool(kept.get("source") == source)
+
+
+def _header(outfit: Outfit) -> Any:
+    """What the file of an outfit's scans says of itself; None where there is none, or it is damaged."""
     try:
-        return bool(read_header(outfit.subject.path).get("source") == source)
+        return read_header(outfit.subject.path)
     except (CheckpointError, UnsafeFileError):
-        return False
+        return None
 
 
 def subjects_of(dataset: Dataset) -> Iterator[Subject]:

@@ -11,16 +11,20 @@ from scipy.spatial.transform import Rotation
 from datagen.common.errors import RecipeError, reason_of
 from datagen.common.files import sha256_of
 from datagen.common.npz import FAULTS, read_arrays
-from datagen.mesh.rig import Rig
+from datagen.mesh.geometry import Mesh
+from datagen.mesh.rig import Rig, skinned
 from datagen.poses import Poses
-from datagen.poses.pose_files import read_pose_file
+from datagen.poses.pose_files import MAKE_ONE, read_pose_file
 from training.avatar.body import CanonicalBody, canonical_body
 from training.avatar.subject import Subject, posed_by
 
 _LARGEST_GAP = 0.1
 """Metres: half of a body's vertices lie nearer to its scan, or one of the two is another person's, pose's or unit's."""
-_CHECKED = 5  # scans of each file that are held against the body
+_CHECKED = 500  # vertices of the body that every scan is held against
+_LARGEST = 1e3  # metres; what is further is no person
 _UNSEEN = 7  # one scan of so many is not learned from, where the file does not say which: the last ones
+_OFF_ONE = 1e-3  # that weights may sum to more or less than one
+_FEWEST, _MOST_PARTS = 2, 99
 _DOCUMENTED = "docs/avatar.md says what such a file holds"
 _SHAPES: dict[str, tuple[str, str]] = {
     "scans": ("fiu", "frame v 3"), "faces": ("iu", "f 3"), "parts": ("iu", "v"), "seen": ("b", "frame"),
@@ -60,7 +64,7 @@ def read_person(path: Path) -> Subject:
     RecipeError
         It is no such file, or the body is not where the scans are.
     """
-    source, poses = person_source(path), read_pose_file(path)
+    source, poses = person_source(path), _poses(path)
     arrays = _arrays(path, poses)
     scans, places = arrays["scans"].astype(np.float64), arrays["body_joints"].astype(np.float64)
     upright, rotations = _at_home(scans, poses, places[0], arrays.get("translations"))
@@ -77,6 +81,7 @@ def read_person(path: Path) -> Subject:
         rotations=rotations.astype(np.float32),
         is_seen=arrays.get("seen", np.arange(len(scans)) < len(scans) - max(1, len(scans) // _UNSEEN)),
     )
+    _require_outwards(path, found)
     _require_near(path, found)
     return found
 
@@ -86,6 +91,13 @@ def person_source(path: Path) -> str:
     if not path.is_file():
         raise RecipeError(f"no file of scans at {str(path)!r}. {_DOCUMENTED}")
     return sha256_of(path)
+
+
+def _poses(path: Path) -> Poses:
+    try:
+        return read_pose_file(path)
+    except RecipeError as error:
+        raise RecipeError(str(error).replace(MAKE_ONE, _DOCUMENTED)) from error
 
 
 def _arrays(path: Path, poses: Poses) -> dict[str, NDArray[Any]]:
@@ -108,40 +120,67 @@ def _require_shape(
     path: Path, name: str, array: NDArray[Any], kinds: str, axes: list[str], sizes: dict[str, int]
 ) -> None:
     """``sizes``: of the axes so far, to which an array adds those that it is the first to have."""
-    fits = array.dtype.kind in kinds and array.ndim == len(axes) and array.size > 0
-    for axis, length in zip(axes, array.shape, strict=False):
-        wanted = int(axis) if axis.isdigit() else sizes.setdefault(axis, length)
-        fits = fits and length == wanted
-    if not fits:
-        shape = ", ".join(str(sizes.get(axis, axis)) for axis in axes)
-        kind = {"b": "true or false", "iu": "whole numbers", "fiu": "numbers"}[kinds]
-        raise RecipeError(
-            f"{path}: {name!r} has shape {list(array.shape)} and type {array.dtype}; it must be {kind} [{shape}], "
-            f"which is [{', '.join(axes)}]. {_DOCUMENTED}"
-        )
+    wanted = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
+    lengths = [length if known is None else known for known, length in zip(wanted, array.shape, strict=False)]
+    if array.dtype.kind in kinds and array.size and array.shape == tuple(lengths) and len(lengths) == len(axes):
+        sizes.update((axis, length) for axis, length in zip(axes, lengths, strict=True) if not axis.isdigit())
+        return
+    shape = ", ".join(axis if length is None else str(length) for axis, length in zip(axes, wanted, strict=True))
+    kind = {"b": "true or false", "iu": "whole numbers", "fiu": "numbers"}[kinds]
+    raise RecipeError(
+        f"{path}: {name!r} has shape {list(array.shape)} and type {array.dtype}; it must be {kind} [{shape}], which is "
+        f"[{', '.join(axes)}]. {_DOCUMENTED}"
+    )
 
 
 def _require_values(path: Path, arrays: dict[str, NDArray[Any]], poses: Poses) -> None:
     for name, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise RecipeError(f"{path}: {name!r} holds what is no finite number. Leave such scans out")
+        strange = np.argwhere(~(np.abs(array.astype(np.float64)) <= _LARGEST))
+        if array.dtype.kind == "f" and len(strange):
+            place = tuple(strange[0].tolist())
+            raise RecipeError(
+                f"{path}: {name!r} holds {array[place]} at {list(place)}; numbers up to {_LARGEST:,.0f} are read, in "
+                f"metres. {_DOCUMENTED}"
+            )
     for faces, vertices in (("faces", arrays["scans"].shape[1]), ("body_faces", len(arrays["body_vertices"]))):
         if arrays[faces].min() < 0 or arrays[faces].max() >= vertices:
             raise RecipeError(
                 f"{path}: {faces!r} goes from {arrays[faces].min()} to {arrays[faces].max()}, but there are "
                 f"{vertices:,} vertices. Count from 0"
             )
-    weights = arrays["body_weights"]
-    if weights.min() < 0 or np.abs(weights.sum(axis=1) - 1).max() > 1e-3:
-        raise RecipeError(f"{path}: 'body_weights' must be 0 or more, and those of a vertex sum to one. {_DOCUMENTED}")
-    if "parts" in arrays and not 0 < arrays["parts"].max() < 100:
-        raise RecipeError(f"{path}: 'parts' must be 0 for skin and from 1 on for cloth, of which there must be some")
-    if "parts" in arrays and arrays["parts"].min() < 0:
-        raise RecipeError(f"{path}: 'parts' holds {arrays['parts'].min()}; skin is 0, cloth from 1 on")
+    sums, least = arrays["body_weights"].sum(axis=1), arrays["body_weights"].min(axis=1)
+    wrong = np.flatnonzero((np.abs(sums - 1) > _OFF_ONE) | (least < 0))
+    if len(wrong):
+        raise RecipeError(
+            f"{path}: 'body_weights' of vertex {wrong[0]} go down to {least[wrong[0]]:.3g} and sum to "
+            f"{sums[wrong[0]]:.3g}; they must be 0 or more, and sum to one. {_DOCUMENTED}"
+        )
+    if "parts" in arrays:
+        _require_parts(path, arrays["parts"], arrays["faces"])
     if poses.parents[0] != -1 or -1 in poses.parents[1:]:
         raise RecipeError(f"{path}: 'parents' must have one root, which comes first. {_DOCUMENTED}")
-    if len(poses) < 2 or not arrays.get("seen", np.ones(1, bool)).any():
-        raise RecipeError(f"{path}: an avatar needs two scans or more, and some that are learned from ('seen')")
+    seen = arrays.get("seen", np.arange(len(poses)) > 0)
+    if seen.sum() < _FEWEST:
+        raise RecipeError(
+            f"{path}: {seen.sum()} of {len(poses)} scans are learned from, {_FEWEST} are the fewest. Add scans, or let "
+            "'seen' say so of more"
+        )
+
+
+def _require_parts(path: Path, parts: NDArray[Any], faces: NDArray[Any]) -> None:
+    most = int(parts.max())
+    if not (parts.min() >= 0 and 0 < most <= _MOST_PARTS):
+        raise RecipeError(
+            f"{path}: 'parts' goes from {parts.min()} to {most}; skin is 0, cloth from 1 to {_MOST_PARTS}, and there "
+            "must be some"
+        )
+    whole = parts[faces[(parts[faces] == parts[faces[:, :1]]).all(axis=1), 0]]
+    missing = sorted(set(range(1, most + 1)) - set(whole.tolist()))
+    if missing:
+        raise RecipeError(
+            f"{path}: no triangle of 'faces' lies in part {missing[0]} of 'parts' with all three corners. Number parts "
+            f"from 1 to {most} without gaps"
+        )
 
 
 def _at_home(
@@ -170,11 +209,29 @@ def _body(arrays: dict[str, NDArray[Any]], poses: Poses) -> CanonicalBody:
     return canonical_body(rig, vertices, arrays["body_faces"], poses.joints, poses.parents)
 
 
+def _require_outwards(path: Path, subject: Subject) -> None:
+    """Triangles that look inwards would say that all around the person is inside."""
+    scan, label = subject.scan(0), subject.parts[subject.faces]
+    meshes = {"'body_faces'": Mesh(subject.body.vertices, subject.body.faces)}
+    for part in range(1, int(subject.parts.max()) + 1):
+        meshes[f"'faces' of part {part}"] = Mesh(scan.vertices, subject.faces[(label == part).all(axis=1)])
+    for name, mesh in meshes.items():
+        first, second, third = (mesh.vertices[mesh.faces] - mesh.vertices[mesh.faces].mean(axis=(0, 1))).swapaxes(0, 1)
+        volume = float((first * np.cross(second, third)).sum() / 6)
+        if volume <= 0:
+            raise RecipeError(
+                f"{path}: {name} enclose {1000 * volume:.3g} litres, so they look inwards or have no area. Turn them "
+                "round: faces[:, ::-1]"
+            )
+
+
 def _require_near(path: Path, subject: Subject) -> None:
     """A body that is not in its scans would be learned from without a word."""
-    for frame in np.unique(np.linspace(0, len(subject.scans) - 1, _CHECKED).astype(int)).tolist():
-        posed = subject.posed(frame).vertices
-        gap = float(np.median(cKDTree(subject.scans[frame]).query(posed)[0]))
+    body = subject.body
+    some = np.linspace(0, len(body.vertices) - 1, min(_CHECKED, len(body.vertices))).astype(int)
+    posed = skinned(body.vertices[some], body.weights[some], subject.transforms.astype(np.float64))
+    for frame, places in enumerate(posed):
+        gap = float(np.median(cKDTree(subject.scans[frame]).query(places)[0]))
         if gap > _LARGEST_GAP:
             raise RecipeError(
                 f"{path}: the body in pose {frame} lies {100 * gap:.0f} cm from scan {frame} (the median of its "

@@ -1,5 +1,6 @@
 """The recipe of an avatar: the scans, the field, the templates, the points, and what is measured."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -11,6 +12,7 @@ from datagen.recipe import ClothedBody, DatasetRecipe, Frozen
 from datagen.recipe.text import changed, parse_words, read_values, require_plain
 from training.recipes.networks import AvatarRecipe, TemplateRecipe
 from training.recipes.training import TrainingRecipe
+from workflows.pipeline.ray_cluster import require_reachable
 from workflows.recipe.loader import recipe_faults, with_absolute_paths
 from workflows.recipe.names import file_of, known_files
 
@@ -85,6 +87,12 @@ class AvatarWorkflow(Frozen):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"people: two files are called {twice[0]!r}, which is the name of the outfit; rename one")
+        strange = [name for name in names if not re.fullmatch(r"\w[\w .-]*", name)]
+        if strange:
+            raise ValueError(
+                f"people: {strange[0]!r} becomes the name of an outfit and of folders; let it begin with a letter or "
+                "digit, and hold only letters, digits, blanks and . _ -"
+            )
 
 
 def known_avatars() -> dict[str, Path]:
@@ -109,8 +117,15 @@ def load_avatar(
     require_plain(values, where=f"recipe {name_or_file}")
     if not isinstance(values, dict):
         raise RecipeError(f"recipe {name_or_file} is not a mapping of sections (data, field, scans, template, avatar)")
-    values = with_absolute_paths(changed(values, parse_words(overrides, option="--set ")), path.resolve().parent)
+    words = parse_words(overrides, option="--set ")
+    values = with_absolute_paths(changed(values, words), path.resolve().parent)
     if people:
-        values = {**values, "data": None, "people": [str(Path(path).expanduser().resolve()) for path in people]}
+        without = [word for word in overrides if word.startswith(("data", "people"))]
+        if without:
+            raise RecipeError(f"--set {without[0]} has no effect beside --people: take one of the two away")
+        values = {**values, "data": None, "people": [str(each) for each in people]}
+    if isinstance(values.get("people"), list):
+        folder = Path.cwd() if people else path.resolve().parent
+        values["people"] = [require_reachable(str(folder / str(its)), option="--people") for its in values["people"]]
     with recipe_faults(name_or_file, keys="dsffnet avatar train --help-all"):
         return AvatarWorkflow.model_validate(values)

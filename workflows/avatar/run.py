@@ -69,8 +69,9 @@ def _refuse_conflicts(recipe: AvatarWorkflow, folder: AvatarFolder) -> None:
     if not folder.recipe.exists():
         return
     there = load_avatar(str(folder.recipe))
-    made = ("data", "people", "field", "scans", "cell")
-    changed = [name for name in made if getattr(recipe, name) != getattr(there, name)]
+    changed = [name for name in ("data", "field", "scans", "cell") if getattr(recipe, name) != getattr(there, name)]
+    if [Path(path).name for path in recipe.people] != [Path(path).name for path in there.people]:
+        changed.append("people")
     if changed:
         raise RecipeError(
             f"{folder.path} was made by another recipe: {', '.join(changed)} differ. Choose another --out, or add "

@@ -93,6 +93,7 @@ def avatar_command(options: argparse.Namespace) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from datagen.common.files import read_text_within
+    from workflows.avatar.outfits import require_people
     from workflows.avatar.recipe import load_avatar
     from workflows.avatar.run import run_avatar
     from workflows.pipeline.console import at_work, print_text
@@ -100,10 +101,15 @@ def _train(options: argparse.Namespace) -> None:
     from workflows.pipeline.run_folder import AvatarFolder
     from workflows.pipeline.tasks import TaskRunner
 
-    recipe = load_avatar(options.recipe, options.set, people=options.people)
+    recipe = load_avatar(
+        options.recipe,
+        options.set,
+        people=[require_reachable(its, option="--people") for its in options.people],
+    )
     out = Path(require_reachable(options.out or f"runs/{Path(options.recipe).stem}", option="--out"))
     folder = AvatarFolder(out)
     folder.require_kind()
+    require_people(recipe, folder, fresh=options.fresh)
     with at_work(options, folder, recipe.data, local=options.local):
         run_avatar(recipe, out, TaskRunner(local=options.local))
     print_text(

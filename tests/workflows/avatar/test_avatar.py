@@ -21,7 +21,7 @@ from tests.support.commands import command
 from tests.support.shapes.outfits import drawn_outfit, person_arrays, stockinged
 from workflows.avatar.animate import poses_of
 from workflows.avatar.evaluate import Measured, markdown
-from workflows.avatar.outfits import is_draped, is_of, make_outfits, outer_scan, wearers
+from workflows.avatar.outfits import is_draped, is_of, outer_scan, require_people, wearers
 from workflows.avatar.recipe import known_avatars, load_avatar
 from workflows.avatar.run import run_avatar
 from workflows.pipeline.run_folder import AvatarFolder
@@ -252,8 +252,20 @@ def test_from_scans_of_ones_own_to_an_animation(recipe: Path, tmp_path: Path) ->
     assert walk.returncode == 0 and (tmp_path / "walk.glb").stat().st_size > 1000, walk.stderr
     other = command(*words[:-4], "--set", "field.centres=80", "field.spacing=0.08", "cell=0.05")
     assert other.returncode != 0 and "was made by another recipe: cell differ" in other.stderr
-    missing = command(*words[:5], str(tmp_path / "nobody.npz"), "--out", str(tmp_path / "other"), "--local")
+    missing = command(*words[:5], str(tmp_path / "nobody.npz"), "--out", str(out), "--local", "--fresh")
     assert missing.returncode != 0 and "no file of scans at" in missing.stderr, missing.stderr
+    assert (out / "evaluation" / "tables.md").exists(), "nothing is removed for what cannot be begun"
+    strangers = {"poses": np.zeros((2, 1, 3)), "joints": np.array(["tail"]), "parents": np.array([-1])}
+    np.savez(tmp_path / "strangers.npz", **strangers)
+    still = command("avatar", "animate", str(out), "-o", str(tmp_path / "x.glb"), "--poses",
+                    str(tmp_path / "strangers.npz"))  # fmt: skip
+    assert still.returncode != 0 and "the poses turn tail, ..., none of which ann has" in still.stderr
+    np.savez(tmp_path / "ann.npz", **{**person_arrays(), "parts": np.ones(384, int)})
+    changed = command(*words)
+    assert changed.returncode != 0 and "ann.npz is not the file that" in changed.stderr
+    (tmp_path / "ann.npz").unlink()
+    gone = command(*words)
+    assert gone.returncode == 0 and "outfits: skipped" in gone.stdout, "what was made of it is there"
 
 
 @pytest.mark.parametrize(
@@ -262,12 +274,18 @@ def test_from_scans_of_ones_own_to_an_animation(recipe: Path, tmp_path: Path) ->
         ({"data": None}, r"need one of the two, scans that are made or files of one's own"),
         ({"people": ["ann.npz"]}, r"need one of the two"),
         ({"data": None, "people": ["a/ann.npz", "b/ann.npz"]}, r"two files are called 'ann'"),
+        ({"data": None, "people": ["...npz"]}, r"'\.\.' becomes the name of an outfit and of folders"),
     ],
 )
 def test_scans_are_made_or_ones_own(change: dict[str, Any], said: str, recipe: Path) -> None:
     recipe.write_text(yaml.safe_dump(TINY | change))
     with pytest.raises(RecipeError, match=said):
         load_avatar(str(recipe))
+
+
+def test_keys_of_data_are_refused_beside_people(recipe: Path) -> None:
+    with pytest.raises(RecipeError, match=r"--set data.poses.seed=4 has no effect beside --people"):
+        load_avatar(str(recipe), ["data.poses.seed=4"], people=["ann.npz"])
 
 
 def test_people_learned_together_have_the_same_joints(recipe: Path, tmp_path: Path) -> None:
@@ -277,7 +295,10 @@ def test_people_learned_together_have_the_same_joints(recipe: Path, tmp_path: Pa
                                       "parents": np.array(PARENTS)})  # fmt: skip
     given = load_avatar(str(recipe), people=[tmp_path / "ann.npz", tmp_path / "ben.npz"])
     with pytest.raises(RecipeError, match=r"ben.npz has other joints than .*ann.npz"):
-        make_outfits(given, AvatarFolder(tmp_path / "run"), TaskRunner(local=True))
+        require_people(given, AvatarFolder(tmp_path / "run"), fresh=False)
+    with pytest.raises(RecipeError, match=r"ann.npz has 3 scans to learn from, fewer than template.batch, 4"):
+        require_people(load_avatar(str(recipe), ["template.batch=4"], people=[tmp_path / "ann.npz"]),
+                       AvatarFolder(tmp_path / "run"), fresh=False)  # fmt: skip
 
 
 def _person(path: Path) -> Path:
