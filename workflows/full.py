@@ -160,7 +160,7 @@ def closing_words(folder: SingleRunFolder, server: Server, *, beside: bool = Fal
     table = read_text_within(folder.run.evaluation.path, "tables.md")
     shown = Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
     run, other = (shlex.quote(str(shown / each.path.name)) for each in (folder.run, folder.beside))
-    runs = f"{run}, and beside it {other}" if beside else run
+    runs, best = (f"{run}, and beside it {other}", other) if beside else (run, run)
     here = shown / "run" / "evaluation"
     meshes = shlex.quote(str(here / "meshes"))
     programs = _programs()
@@ -184,7 +184,7 @@ Where everything lies
 
 Try next
   {ui}
-  {dsffnet} transfer --model {run} --source {meshes}/00-source.glb --target {meshes}/01-target.glb --out posed.glb
+  {dsffnet} transfer --model {best} {meshes}/00-source.glb {meshes}/01-target.glb -o posed.glb --picture
   {programs}python workflows/full.py --out runs/custom --set data.identities.seed=7 data.identities.training=24
 """
 

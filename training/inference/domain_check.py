@@ -170,7 +170,8 @@ def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
     if sizes[0] < _MAIN_SHARE * sizes.sum():
         yield (
             f"{name} has {len(sizes)} separate parts, the largest with {sizes[0] / sizes.sum():.0%} of the vertices: "
-            "one body is posed as a whole; choose it by --source-geometry or --target-geometry, or save it by itself"
+            "one body is posed as a whole; save it by itself, or choose it by --source-geometry or --target-geometry "
+            "where the file has names"
         )
 
 

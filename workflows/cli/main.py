@@ -8,6 +8,7 @@ from itertools import chain
 
 from workflows.cli import avatar, data, demo, runs, skin, studies, submit, transfer, ui
 from workflows.pipeline.console import guarded
+from workflows.recipe.names import nearest
 
 _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
 _GROUPS = {
@@ -41,7 +42,10 @@ def parsed(words: Sequence[str]) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = made.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog=made.prog)
-    for command in chain.from_iterable(_GROUPS.values()):
+    known = {command.name: command for command in chain.from_iterable(_GROUPS.values())}
+    if words and not words[0].startswith("-") and words[0] not in known:
+        made.error(f"there is no command {words[0]!r}{nearest(words[0], list(known))}; there are {', '.join(known)}")
+    for command in known.values():
         command.add_to(commands, words=words[1:] if command.name in words[:1] else None)
     return made.parse_args(_with_axes_joined(words))
 

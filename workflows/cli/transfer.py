@@ -11,7 +11,7 @@ from datagen.common.printable import printable
 from datagen.common.resources import memory_errors
 from training.tracking.record import Server
 from workflows.cli.declare import Command, Parser, add_checkpoint_option
-from workflows.pipeline.console import print_text, server_of
+from workflows.pipeline.console import print_note, print_text, server_of
 
 _OWN_STORE = Path("runs/quickstart/mlflow.db")
 
@@ -78,7 +78,7 @@ def transfer_command(options: argparse.Namespace) -> None:
       dsffnet transfer pose.obj person.glb -o posed.glb --picture --viewer
       dsffnet transfer walk/ person.glb -o walking.glb --smooth 7
       dsffnet transfer character.glb person.glb --animation Walk -o walking.glb
-      dsffnet transfer --model runs/quickstart --source pose.obj --target person.obj --out posed.obj
+      dsffnet transfer --model runs/quickstart/beside --source pose.obj --target person.obj --out posed.obj
       dsffnet transfer scan.ply person.obj -o posed.obj --model models:/dsffnet@latest-trained --align --refine
     """
     from datagen.characters.motion import animation_names
@@ -102,6 +102,7 @@ def transfer_command(options: argparse.Namespace) -> None:
         weights_of(options) as weights,
         memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"),
     ):
+        print_note("loading the network ...")
         from workflows.transfer.run import TransferWork
 
         work = TransferWork.of(job, weights, first=source.mesh, target=target, force=options.force)

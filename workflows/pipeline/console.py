@@ -166,6 +166,12 @@ def print_text(text: object) -> None:
     print(printable_lines(text), flush=True)
 
 
+def print_note(line: object) -> None:
+    """Print one line on standard error for somebody who waits at a terminal; logs and pipes are spared it."""
+    if sys.stderr.isatty():
+        print(printable(line), file=sys.stderr, flush=True)
+
+
 def warn(line: object) -> None:
     """Print one line on standard error."""
     print(f"warning: {printable(line)}", file=sys.stderr)

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
-from training.checkpoints.checkpoint import Checkpoint, Which, require_checkpoint
 from workflows.pretrained import own_names, weights_named
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # torch takes seconds to import, and what is wrong with files is said before
     from datagen.store import Dataset
+    from training.checkpoints.checkpoint import Checkpoint, Which
 
 _WEIGHTS = ".safetensors"
 
@@ -23,7 +23,7 @@ class Evaluated:
     result of a run, or those that were exported as weights.safetensors).
     """
 
-    checkpoint: Checkpoint
+    checkpoint: "Checkpoint"
     home: Path
     label: str
 
@@ -41,7 +41,7 @@ class Evaluated:
         return self.home / name
 
 
-def evaluated(place: Path, which: Which = "result") -> Evaluated:
+def evaluated(place: Path, which: "Which" = "result") -> Evaluated:
     """The weights that a person names: a run, a workflow's folder, RUN/checkpoints/step-N, or exported weights.
 
     Raises
@@ -49,6 +49,8 @@ def evaluated(place: Path, which: Which = "result") -> Evaluated:
     CheckpointError
         There are none, or they are damaged.
     """
+    from training.checkpoints.checkpoint import require_checkpoint
+
     checkpoint, step = require_checkpoint(place, which, weights_only=True), _step_folder(place)
     if step is not None:
         return Evaluated(checkpoint, step.parent.parent, f"step-{checkpoint.step}")
