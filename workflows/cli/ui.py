@@ -47,6 +47,7 @@ def _server(database: Path, port: int) -> list[str]:
     prepare_store(server)
     return [
         *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
+        *("--uvicorn-opts", "--log-level warning"),
         *("--backend-store-uri", server.uri, "--artifacts-destination", str(server.artifacts)),
     ]
 
@@ -86,7 +87,8 @@ def _parent_is_gone() -> Callable[[], bool]:
 def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
     """Run a server until it ends by itself (its status), or ``ended`` says so (0); a signal ends it too."""
     signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))  # a closed terminal, of nohup too
-    quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes fewer
+    quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # eight processes fewer
+             "PYTHONWARNINGS": "ignore"}  # fmt: skip
     keeper = subprocess.Popen(
         [sys.executable, "-m", "workflows.cli.keeper", *command],
         stdin=subprocess.PIPE,
@@ -98,6 +100,8 @@ def _serve(command: list[str], *, ended: Callable[[], bool]) -> int:
         while keeper.poll() is None and not ended():
             time.sleep(_LOOK_SECONDS)
         return keeper.poll() or 0
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("MLflow's page is closed") from interrupt
     finally:
         keeper.stdin.close()
         keeper.wait()
