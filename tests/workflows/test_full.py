@@ -58,7 +58,7 @@ def start(out: Path, *arguments: str, **environment: str) -> subprocess.Popen[st
 
 def run(out: Path, *arguments: str, **environment: str) -> tuple[int, str]:
     process = start(out, *arguments, **environment)
-    output, _ = process.communicate(timeout=600)
+    output, _ = process.communicate(timeout=300)
     return process.returncode, output
 
 
@@ -265,18 +265,18 @@ def test_sigkill_of_a_server_of_ray(stage: str, server: str, undisturbed: Path, 
     arguments, done = (on_ray(out), shards) if stage == "generate" else (longer(out), trained_steps)
     process = start(out, *arguments)
     wait_for(lambda: done(out) >= 30 and bool(family(process, "ray::")), process)
-    assert_ends_with_its_server(process, server)
+    last_words = assert_ends_with_its_server(process, server)
     record = read_record(out / ("run" if stage == "train" else "generate"))
-    # RUNNING where Ray's library, or our watch, ended the process at once, as SIGKILL does: what follows sees that
-    assert record is not None and record.status in ("FAILED", "KILLED", "RUNNING")
+    killed = last_words.startswith(ENDED)  # as by SIGKILL: what follows sees that it no longer runs
+    assert record is not None and record.status in ("FAILED", "KILLED", *(["RUNNING"] if killed else []))
     status, output = run(out, *arguments)
     assert status == 0, output
     if stage == "train":
         assert_equal(out, undisturbed)
 
 
-def assert_ends_with_its_server(process: subprocess.Popen[str], server: str) -> None:
-    """Kill a server: the process ends soon, with one line that says so."""
+def assert_ends_with_its_server(process: subprocess.Popen[str], server: str) -> str:
+    """Kill a server; the line with which the process ends."""
     rays = family(process, "ray")
     (victim,) = [child for child in rays if child.name() == server]
     victim.kill()
@@ -288,6 +288,7 @@ def assert_ends_with_its_server(process: subprocess.Popen[str], server: str) -> 
     assert last.startswith((f"error: Ray's {server} has died", ENDED)), output
     assert "Traceback" not in output
     wait_until_gone(rays)
+    return last
 
 
 def test_nothing_of_ray_outlives_a_driver_that_is_ended_while_it_trains(tmp_path: Path) -> None:
@@ -340,7 +341,6 @@ def test_tracking_server_down_costs_nothing_but_the_exit_status(tmp_path: Path) 
     assert len(json.loads((out / "mlflow.json").read_text())) == 1
 
 
-@pytest.mark.timeout(900)  # Ray starts the ranks anew, eight times
 def test_a_full_disk_ends_it_with_one_error_and_it_goes_on_once_there_is_room(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", kibibytes=3_000) as disk:
         status, output = run(disk / "out", *longer(disk / "out"))

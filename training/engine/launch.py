@@ -29,6 +29,7 @@ from training.recipes.training import TrainingRecipe
 
 log = logging.getLogger(__name__)
 _RESTARTS, _FAILURE, _MARK = 3, "failure.json", ".launch"
+_ROOM, _ROOM_BYTES = ".room", 2**16  # given up when a rank leaves its failure, for which a full disk has no other
 _LOST = (
     "another rank has ended, or its host cannot be reached ({}). Run the same command again on every host: it resumes "
     "from the newest checkpoint"
@@ -72,6 +73,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
         (run / left_over).unlink(missing_ok=True)
     mark = uuid.uuid4().hex
     write_atomically(run / _MARK, mark.encode())
+    write_atomically(run / _ROOM, bytes(_ROOM_BYTES))
     told = {"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark, "began": began}
     try:
         with on_sigterm((run / STOP_FILE).touch):  # the ranks finish their step, write a checkpoint and end
@@ -85,7 +87,8 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
             "Run the same command again to resume from the newest checkpoint"
         ) from error
     finally:
-        (run / STOP_FILE).unlink(missing_ok=True)
+        for over in (STOP_FILE, _ROOM):
+            (run / over).unlink(missing_ok=True)
     failure = failure_of(run)
     if failure:
         raise failure
@@ -164,6 +167,7 @@ def train_rank(config: dict[str, Any]) -> None:
     except DsffnetError as error:
         if not (getattr(error, "secondary", False) and (run / _FAILURE).exists()):
             about = {"message": str(error), "status": error.exit_status, "stopped": isinstance(error, TrainingStopped)}
+            (run / _ROOM).unlink(missing_ok=True)
             write_atomically(run / _FAILURE, json.dumps(about).encode())
         raise
 

@@ -118,6 +118,7 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         id=(before.id if before else "") or uuid.uuid4().hex,
     )
     write_record(folder, record)
+    _begun.add(folder)
     return record
 
 
@@ -132,6 +133,18 @@ def update_record(folder: Path, **changes: Any) -> None:
 def end_record(folder: Path, status: Status) -> None:
     """Mark a record as ended now."""
     update_record(folder, status=status, ended=_now())
+    _begun.discard(folder)
+
+
+_begun: set[Path] = set()
+"""Folders whose records this process has begun and not ended."""
+
+
+def fail_begun() -> None:
+    """Mark all records as FAILED that this process has begun and not ended: it may be ended at any moment now."""
+    for folder in list(_begun):
+        if has_record(folder):  # it may have been removed
+            end_record(folder, "FAILED")
 
 
 def parent_of(folder: Path, record: Record) -> Path | None:

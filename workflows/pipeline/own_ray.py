@@ -14,7 +14,8 @@ from typing import Any
 
 import psutil
 
-from datagen.common.errors import ClusterError
+from datagen.common.errors import ClusterError, DsffnetError
+from training.tracking.record import fail_begun
 from training.tracking.threads import background
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -252,6 +253,8 @@ class _Watch:
 
         What is left of Ray lives until then: its client library ends the process at once when the raylet goes.
         """
+        with suppress(OSError, DsffnetError):  # the words are said all the same
+            fail_begun()
         self.words.be(f"error: {self.message}")
         main = threading.main_thread().ident
         assert main is not None

@@ -138,6 +138,7 @@ class RunFolder(_Folder):
     traceback = _file("failure.txt")
     not_finite = _file("not-finite.json")
     launch_mark = _file(".launch")
+    room = _file(".room")
     ray = _file("ray")
     evaluation = _Entry("evaluation", EvaluationFolder)
     lock = _file(".driver.lock", kept=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from datagen.common.errors import BudgetSpent, RecipeError, TrainingError
+from datagen.common.errors import BudgetSpent, RecipeError, StorageError, TrainingError
 from tests.support.ranks import ROOT, Forked, finish
 from tests.support.recipes import tiny_training
 from training.checkpoints.checkpoint import require_checkpoint
@@ -51,6 +51,25 @@ def test_without_progress_or_told_to_stop_or_with_something_to_mend_it_ends(
     with pytest.raises(RuntimeError, match="a node was lost"):
         launch.fit_while_progressing(fit, tmp_path)
     assert fit.calls == (2 if left_over is None else 1)
+
+
+def test_a_rank_whose_disk_is_full_leaves_its_failure_in_the_room_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = tmp_path / ".room"
+    room.write_bytes(bytes(2**16))
+
+    def write_where_there_is_room(path: Path, content: bytes) -> None:
+        if room.exists():
+            raise StorageError(f"could not write {path}: No space left on device")
+        path.write_bytes(content)
+
+    monkeypatch.setattr(launch, "write_atomically", write_where_there_is_room)
+    told = {"run": str(tmp_path), "mark": "none", "recipe": {}, "data": "", "began": 0.0}
+    with pytest.raises(TrainingError, match="does not see"):
+        launch.train_rank(told)
+    failure = launch.failure_of(tmp_path)
+    assert failure is not None and "does not see" in str(failure)
 
 
 @pytest.mark.parametrize(
