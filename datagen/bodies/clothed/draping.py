@@ -20,8 +20,8 @@ from datagen.common.quiet_warp import wp
 from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 
-_KEPT, _KEPT_SETTLING = 0.98, 0.9  # of the velocity at each step
 _REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
+_FALL = 3.0  # metres a second squared, fading while cloth settles: hung cloth has one shape, but few steps do not carry its weight
 _DENSITY = 0.2  # kilograms a square metre
 _STRETCHED, _COMPRESSED = 1e-10, 1e-7  # compliance of edges, metres a newton
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
@@ -89,19 +89,19 @@ class Cloth:
                 ways = turns[station - 1], shifts[station - 1], turns[station], shifts[station]
                 _launch(advect, len(state.place), self._skin, *ways, state)
                 _launch(hang, len(self._pins.vertex), self._pins, self._mesh.points, state)
-            self._relax(solver.substeps, _KEPT)
+            self._relax(solver.substeps, _FALL)
         for begun in range(0, solver.settle, _TOGETHER):
-            self._relax(min(_TOGETHER, solver.settle - begun), _KEPT_SETTLING)
+            self._relax(min(_TOGETHER, solver.settle - begun), _FALL * (1 - begun / solver.settle))
         found: NDArray[np.float32] = np.round(state.place.numpy().astype(np.float64) * _GRID) / _GRID
         return found.astype(np.float32)
 
-    def _relax(self, steps: int, kept: float) -> None:
+    def _relax(self, steps: int, gravity: float) -> None:
         state = self._state
         _launch(touch, len(state.place), self._mesh.id, _REACH, state)
         for first, count, below in self._parts:
             below.refit()
             _launch(touch_part, count, below.id, first, _REACH_PARTS, state)
-        _launch(take_steps, 1, steps, kept, self._edges, self._bends, state)
+        _launch(take_steps, 1, steps, gravity, self._edges, self._bends, state)
 
 
 def depths(vertices: NDArray[np.float32], body: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -136,9 +136,11 @@ def _springs(garment: Garment) -> tuple[Any, Any]:
     starts = np.cumsum(counts) - counts
     inner = starts[counts == 2]
     pairs = np.stack([across[inner], across[inner + 1]], axis=1)
+    light = (1 / _masses(garment.rest.vertices, faces))[pairs].sum(axis=1)
+    unbent = STEP**2 * light * (1 / garment.bending[pairs[:, 0]] - 1)
     return (
         _springs_of(garment, edges, np.full(len(edges), _STRETCHED), np.full(len(edges), _COMPRESSED)),
-        _springs_of(garment, pairs, garment.bending[pairs[:, 0]], garment.bending[pairs[:, 0]]),
+        _springs_of(garment, pairs, unbent, unbent),
     )
 
 

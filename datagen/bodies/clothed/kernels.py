@@ -10,9 +10,10 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False, "fast_math": 
 
 STEP = wp.constant(1 / 240)
 """Seconds of a step."""
+_KEPT = wp.constant(0.98)  # of the velocity at each step
 _FASTEST = wp.constant(3.0)  # metres a second
-_FRICTION = wp.constant(0.3)
-_PASSES = wp.constant(2)  # over the edges, each step
+_FRICTION = wp.constant(0.1)
+_PASSES = wp.constant(4)  # over the edges, each step
 _GAP = wp.constant(0.003)  # metres between parts
 
 
@@ -187,18 +188,18 @@ def _kept_off(place: wp.vec3, before: wp.vec3, plane: wp.vec3, normal: wp.vec3, 
 @wp.kernel
 def take_steps(
     count: int,
-    kept: float,
+    gravity: float,
     edges: Springs,
     bends: Springs,
     state: State,
 ):
     """So many steps of one cloth, in one thread."""
-    fall = wp.vec3(0.0, -9.81 * STEP, 0.0)
+    fall = wp.vec3(0.0, -gravity * STEP, 0.0)
     for _ in range(count):
         for vertex in range(state.place.shape[0]):
             state.before[vertex] = state.place[vertex]
             if state.inverse_mass[vertex] > 0.0:
-                state.velocity[vertex] = kept * state.velocity[vertex] + fall
+                state.velocity[vertex] = _KEPT * state.velocity[vertex] + fall
                 state.place[vertex] = state.place[vertex] + STEP * state.velocity[vertex]
         for _pass in range(_PASSES):
             _project(edges, state)

@@ -21,7 +21,7 @@ from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
 
-DRAPING = "3"
+DRAPING = "4"
 """To be raised with any change of outfits, cuts or draping that changes bytes: data of two kinds must not mix."""
 _GRID = 2.0**20
 

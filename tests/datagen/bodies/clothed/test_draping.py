@@ -21,7 +21,7 @@ def cloth(places: np.ndarray, pinned: np.ndarray) -> Garment:
     return Garment(
         rest=Rest(places, np.zeros((1, 3)), np.ones((count, 1)), (-1,)), faces=faces, shown=np.arange(count),
         shown_faces=faces, part=np.ones(count, np.int64), pinned=pinned, distance=np.full(count, 0.005),
-        bending=np.full(count, 1e-4), roomy=np.zeros(count, bool), uneased=places,
+        bending=np.full(count, 0.25), roomy=np.zeros(count, bool), uneased=places,
     )  # fmt: skip
 
 
