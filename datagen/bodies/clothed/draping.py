@@ -21,7 +21,7 @@ from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 
 _REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
-_FALL = 3.0  # metres a second squared, fading while cloth settles: hung cloth has one shape, but few steps do not carry its weight
+_FALL = 3.0  # metres a second squared, less while cloth settles: inextensible cloth hangs the same however light it is
 _DENSITY = 0.2  # kilograms a square metre
 _STRETCHED, _COMPRESSED = 1e-10, 1e-7  # compliance of edges, metres a newton
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
@@ -91,7 +91,8 @@ class Cloth:
                 _launch(hang, len(self._pins.vertex), self._pins, self._mesh.points, state)
             self._relax(solver.substeps, _FALL)
         for begun in range(0, solver.settle, _TOGETHER):
-            self._relax(min(_TOGETHER, solver.settle - begun), _FALL * (1 - begun / solver.settle))
+            lighter = 1 - begun / solver.settle
+            self._relax(min(_TOGETHER, solver.settle - begun), lighter * _FALL)
         found: NDArray[np.float32] = np.round(state.place.numpy().astype(np.float64) * _GRID) / _GRID
         return found.astype(np.float32)
 

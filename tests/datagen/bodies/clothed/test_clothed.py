@@ -19,8 +19,18 @@ from datagen.bodies.clothed.model import ClothedModel, body_faces
 from datagen.bodies.clothed.surface import borders
 from datagen.bodies.skinning import skin
 from datagen.common.errors import BodyError
+from datagen.mesh.geometry import edges_of
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
-from datagen.recipe import OUTFITS, AnnyBody, ClothedBody, GarmentPart, OwnOutfit, PhenotypeRanges, PoseRecipe
+from datagen.recipe import (
+    OUTFITS,
+    AnnyBody,
+    ClothedBody,
+    DrapeSolver,
+    GarmentPart,
+    OwnOutfit,
+    PhenotypeRanges,
+    PoseRecipe,
+)
 from tests.support.shapes.bodies import COARSE, identity
 
 ALL_AGES = AnnyBody(topology=COARSE, phenotypes=PhenotypeRanges(age=(0, 1)))
@@ -88,6 +98,18 @@ def test_a_childs_skirt_does_not_climb_on_the_shirt_that_bunches_below_its_waist
     garment = body.person(tuple(parameters)).garment
     waist = garment.rest.vertices[garment.pinned & (garment.part == 2), 1]
     assert draped[:, 1].max() < waist.max() + 0.005
+
+
+def test_a_childs_tight_clothes_are_not_stretched_where_the_pattern_is_crowded() -> None:
+    """Below the arms and in the crotch, where bending that does not give way pulls short edges half as long again."""
+    body = load_body(ClothedBody(body=ALL_AGES, outfits=("tight",), solver=DrapeSolver(subdivide=0)))
+    assert isinstance(body, ClothedModel)
+    drawn = identity(body, 1)
+    person, poses = body.person(tuple(drawn)), draw_poses(PoseRecipe(), range(1, 3))
+    edges = edges_of(person.garment.faces)
+    for posed in body.vertices(drawn, poses)[:, -len(person.garment.shown) :]:
+        stretch = np.linalg.norm(posed[edges[:, 0]] - posed[edges[:, 1]], axis=1) / person.garment.lengths(edges)
+        assert np.median(stretch) < 1.02 and np.percentile(stretch, 99) < 1.3
 
 
 def test_skin_under_clothes_is_not_kept_and_labels_say_what_is_what(model: ClothedModel) -> None:
