@@ -126,7 +126,7 @@ class DrapeSolver(Frozen):
 
     frames: int = Field(24, ge=1, le=1000, description="stations between rest and pose")
     substeps: int = Field(8, ge=1, le=1000, description="steps at each station")
-    settle: int = Field(240, ge=0, le=100_000, description="steps at the pose")
+    settle: int = Field(240, ge=0, le=100_000, description="steps at the pose, in which weight fades")
     subdivide: int = Field(1, ge=0, le=2, description="how often garments are subdivided before they are draped")
 
 

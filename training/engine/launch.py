@@ -12,6 +12,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,7 +30,7 @@ from training.recipes.training import TrainingRecipe
 
 log = logging.getLogger(__name__)
 _RESTARTS, _FAILURE, _MARK = 3, "failure.json", ".launch"
-_ROOM, _ROOM_BYTES = ".room", 2**16  # given up when a rank leaves its failure, for which a full disk has no other
+_ROOM, _ROOM_BYTES = ".room", 2**16  # given up for what a rank leaves of its failure, if the disk is full
 _LOST = (
     "another rank has ended, or its host cannot be reached ({}). Run the same command again on every host: it resumes "
     "from the newest checkpoint"
@@ -73,7 +74,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
         (run / left_over).unlink(missing_ok=True)
     mark = uuid.uuid4().hex
     write_atomically(run / _MARK, mark.encode())
-    write_atomically(run / _ROOM, bytes(_ROOM_BYTES))
+    write_atomically(run / _ROOM, os.urandom(_ROOM_BYTES))  # zeros take no room on some disks
     told = {"recipe": recipe.model_dump(mode="json"), "data": data, "run": str(run), "mark": mark, "began": began}
     try:
         with on_sigterm((run / STOP_FILE).touch):  # the ranks finish their step, write a checkpoint and end
@@ -167,7 +168,8 @@ def train_rank(config: dict[str, Any]) -> None:
     except DsffnetError as error:
         if not (getattr(error, "secondary", False) and (run / _FAILURE).exists()):
             about = {"message": str(error), "status": error.exit_status, "stopped": isinstance(error, TrainingStopped)}
-            (run / _ROOM).unlink(missing_ok=True)
+            with suppress(OSError):
+                (run / _ROOM).unlink()
             write_atomically(run / _FAILURE, json.dumps(about).encode())
         raise
 

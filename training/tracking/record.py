@@ -10,15 +10,18 @@ import os
 import re
 import shlex
 import sys
+import threading
 import time
 import uuid
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from datagen.common.errors import DsffnetError
 from datagen.common.files import read_json_if_whole, set_aside, write_atomically
 
 if TYPE_CHECKING:
@@ -118,33 +121,48 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         id=(before.id if before else "") or uuid.uuid4().hex,
     )
     write_record(folder, record)
-    _begun.add(folder)
+    with _changing:
+        _begun.add(folder)
+        _failed.discard(folder)
     return record
 
 
 def update_record(folder: Path, **changes: Any) -> None:
     """Change fields of the record that is there; other ``metrics`` are marked as measured now."""
-    record = read_record(folder)
-    assert record is not None, f"{folder} has no record to update"
-    measured = _now() if changes.get("metrics", record.metrics) != record.metrics else record.measured
-    write_record(folder, replace(record, **{"measured": measured, **changes}))
+    with _changing:
+        record = read_record(folder)
+        assert record is not None, f"{folder} has no record to update"
+        measured = _now() if changes.get("metrics", record.metrics) != record.metrics else record.measured
+        write_record(folder, replace(record, **{"measured": measured, **changes}))
 
 
 def end_record(folder: Path, status: Status) -> None:
-    """Mark a record as ended now."""
-    update_record(folder, status=status, ended=_now())
-    _begun.discard(folder)
+    """Mark a record as ended now; one of :func:`fail_begun` stays as that left it."""
+    with _changing:
+        _begun.discard(folder)
+        if folder not in _failed:
+            update_record(folder, status=status, ended=_now())
 
 
+_changing = threading.RLock()  # as a thread may call fail_begun
 _begun: set[Path] = set()
 """Folders whose records this process has begun and not ended."""
+_failed: set[Path] = set()
+"""Folders whose records :func:`fail_begun` has ended."""
 
 
 def fail_begun() -> None:
-    """Mark all records as FAILED that this process has begun and not ended: it may be ended at any moment now."""
-    for folder in list(_begun):
-        if has_record(folder):  # it may have been removed
-            end_record(folder, "FAILED")
+    """Mark all records as FAILED that this process has begun and not ended: it may be ended at any moment now.
+
+    Those that were removed, or cannot be written, are passed over.
+    """
+    with _changing:
+        while _begun:
+            folder = _begun.pop()
+            with suppress(OSError, DsffnetError):
+                if has_record(folder):
+                    update_record(folder, status="FAILED", ended=_now())
+                    _failed.add(folder)
 
 
 def parent_of(folder: Path, record: Record) -> Path | None:

@@ -30,7 +30,7 @@ from training.recipes.networks import AvatarRecipe
 from training.tracking.record import update_record
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 from training.viz.style import error_colors
-from workflows.avatar.outfits import draped_finer, is_draped, outer_scan, wearers
+from workflows.avatar.outfits import can_be_draped_again, draped_finer, outer_scan, wearers
 from workflows.avatar.recipe import AvatarEvaluation, AvatarWorkflow
 from workflows.avatar.runs import trained
 from workflows.pipeline.progress import bar
@@ -115,6 +115,7 @@ def _measured(
         for kind in KINDS
     }
     usual = [_usual_displacement(wardrobe, network, number) for number in range(len(wardrobe.subjects))]
+    again = dataset is not None and can_be_draped_again(dataset)
     plainest = [_plainest(subject) for subject in wardrobe.subjects]
     marked = [_footprints(wardrobe, network, number, plainest[number], its) for number, its in enumerate(usual)]
     with bar(total=sum(len(its) for its in frames.values()), what="evaluate", unit="frame") as shown:
@@ -125,7 +126,7 @@ def _measured(
             for frame in its:
                 scan = outer_scan(subject, frame)
                 meshes = _methods(wardrobe, network, number, frame, usual[number])
-                if dataset and kind == "unseen" and is_draped(dataset):
+                if dataset and kind == "unseen" and again:
                     meshes[_FLOOR], footprints[_FLOOR] = _draped_again(dataset, subject, frame, scan)
                 for method, (mesh, normals) in meshes.items():
                     found = score(mesh, normals, scan, samples=recipe.samples, parts=subject.parts)

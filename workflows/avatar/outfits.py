@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.bodies import load_body
-from datagen.bodies.clothed.model import ClothedModel
+from datagen.bodies.clothed.model import DRAPING, ClothedModel
 from datagen.common.errors import CheckpointError, RecipeError, UnsafeFileError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh
@@ -153,9 +153,14 @@ def wearers(dataset: Dataset) -> dict[str, int]:
     return found
 
 
-def is_draped(dataset: Dataset) -> bool:
-    """Whether the clothes of a dataset's people are simulated."""
-    return isinstance(dataset.recipe.body, ClothedBody) and dataset.recipe.body.method == "draped"
+def can_be_draped_again(dataset: Dataset) -> bool:
+    """Whether the clothes of a dataset's people are simulated, and as they would be now."""
+    body = dataset.recipe.body
+    if not isinstance(body, ClothedBody) or body.method != "draped":
+        return False
+    return any(
+        (its["name"], its["version"]) == (DRAPING.name, DRAPING.version) for its in dataset.attributes["body"]["assets"]
+    )
 
 
 def draped_finer(dataset: Dataset, identity: int, frames: Sequence[int]) -> NDArray[np.float32]:

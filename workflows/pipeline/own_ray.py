@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from datagen.common.errors import ClusterError, DsffnetError
+from datagen.common.errors import ClusterError
 from training.tracking.record import fail_begun
 from training.tracking.threads import background
 
@@ -23,7 +23,7 @@ _PACKAGE = f"-packages{os.sep}ray{os.sep}"  # where Ray's own programs lie, in a
 _OBJECT_STORE = 300 * 2**20  # manifest rows and metrics are all that passes through it; Ray's default is 30 % of memory
 _START_SECONDS = (30.0, 150.0)  # Ray's own patience with its node, and ours after that
 _SERVERS = ("gcs_server", "raylet")
-_LOOK_SECONDS, _LEAVE_SECONDS = 0.5, 20.0
+_LOOK_SECONDS, _RECORD_SECONDS, _LEAVE_SECONDS = 0.5, 2.0, 20.0
 _RESUME = "What was complete is kept: run the same command again to resume"
 _ENDED = f"this process has been ended in the middle (killed, or by Ray's client library). {_RESUME}"
 WITHOUT_RAY = "--local, where the command has it (dsffnet train: --set training.launcher=inline training.ranks=1)"
@@ -253,12 +253,13 @@ class _Watch:
 
         What is left of Ray lives until then: its client library ends the process at once when the raylet goes.
         """
-        with suppress(OSError, DsffnetError):  # the words are said all the same
-            fail_begun()
+        failing = threading.Thread(target=fail_begun, daemon=True)
+        failing.start()
         self.words.be(f"error: {self.message}")
         main = threading.main_thread().ident
         assert main is not None
         self._kin += _family()  # of now: children of a parent that dies are nobody's
+        failing.join(_RECORD_SECONDS)  # a disk may hang
         signal.pthread_kill(main, signal.SIGUSR1)
         if not stop.wait(_LEAVE_SECONDS):
             self.end_kin()

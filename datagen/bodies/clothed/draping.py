@@ -1,7 +1,7 @@
 """Cloth draped over a moving body: extended position-based dynamics in small steps, in Warp's kernels on the CPU.
 
-Macklin et al. 2016 (XPBD), with one iteration a step (Macklin et al. 2019). Every pose starts at the T-pose and follows
-a fixed path, so that a garment in a pose is a function of identity and pose alone; it has no inertia left at the end.
+Macklin et al. 2016 (XPBD) and 2019 (small steps in place of iterations; edges get four a step). Every pose starts at
+the T-pose and follows a fixed path, so that a garment in a pose is a function of identity and pose alone.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import scipy.spatial
 from numpy.typing import NDArray
 
 from datagen.bodies.clothed.garments import Garment
-from datagen.bodies.clothed.kernels import STEP, Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
+from datagen.bodies.clothed.kernels import Pins, Skin, Springs, State, advect, hang, take_steps, touch, touch_part
 from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
 from datagen.common.quiet_warp import wp
@@ -21,9 +21,12 @@ from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 
 _REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
-_FALL = 3.0  # metres a second squared, less while cloth settles: inextensible cloth hangs the same however light it is
+_FALL, _FALL_LAST = 5.0, 1.0
+"""Metres a second squared at the stations, and after settling.
+
+Cloth that does not stretch hangs the same however light it is, and few steps do not carry the weight of fine cloth.
+"""
 _DENSITY = 0.2  # kilograms a square metre
-_STRETCHED, _COMPRESSED = 1e-10, 1e-7  # compliance of edges, metres a newton
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
 _TOGETHER = 10  # steps of settling between two searches for contacts
 _DEEP, _MOST_DEEP = 0.01, 0.05  # metres inside of the body at rest, and the share of vertices that may be
@@ -63,7 +66,7 @@ class Cloth:
         state = State()
         for name in ("place", "before", "velocity", "contact", "normal", "under", "under_normal"):
             setattr(state, name, _vectors(np.zeros_like(vertices)))
-        state.inverse_mass = _numbers(np.where(garment.pinned, 0.0, 1 / _masses(vertices, garment.faces)))
+        state.inverse_mass = _numbers(_inverse_masses(garment))
         state.distance = _numbers(garment.distance)
         state.tether, state.pin = _tethers(garment)
         self._state = state
@@ -91,8 +94,8 @@ class Cloth:
                 _launch(hang, len(self._pins.vertex), self._pins, self._mesh.points, state)
             self._relax(solver.substeps, _FALL)
         for begun in range(0, solver.settle, _TOGETHER):
-            lighter = 1 - begun / solver.settle
-            self._relax(min(_TOGETHER, solver.settle - begun), lighter * _FALL)
+            fall = max(_FALL_LAST, _FALL * (1 - begun / solver.settle))
+            self._relax(min(_TOGETHER, solver.settle - begun), fall)
         found: NDArray[np.float32] = np.round(state.place.numpy().astype(np.float64) * _GRID) / _GRID
         return found.astype(np.float32)
 
@@ -128,7 +131,11 @@ def require_outside(garment: Garment, body: Rest, faces: NDArray[np.int64], *, n
 
 
 def _springs(garment: Garment) -> tuple[Any, Any]:
-    """Edges, which resist stretching, and pairs of vertices across an edge, which resist bending."""
+    """Edges, which keep their length, and pairs of vertices across an edge, which resist bending.
+
+    A step undoes a share of what such a pair is too near or too far, whatever the vertices weigh: small triangles,
+    which are light, would be rigid by a compliance that large ones bend by.
+    """
     faces = garment.faces
     sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
@@ -137,12 +144,8 @@ def _springs(garment: Garment) -> tuple[Any, Any]:
     starts = np.cumsum(counts) - counts
     inner = starts[counts == 2]
     pairs = np.stack([across[inner], across[inner + 1]], axis=1)
-    light = (1 / _masses(garment.rest.vertices, faces))[pairs].sum(axis=1)
-    unbent = STEP**2 * light * (1 / garment.bending[pairs[:, 0]] - 1)
-    return (
-        _springs_of(garment, edges, np.full(len(edges), _STRETCHED), np.full(len(edges), _COMPRESSED)),
-        _springs_of(garment, pairs, unbent, unbent),
-    )
+    compliance = _inverse_masses(garment)[pairs].sum(axis=1) * (1 / garment.bending[pairs[:, 0]] - 1)
+    return _springs_of(garment, edges, np.zeros(len(edges))), _springs_of(garment, pairs, compliance)
 
 
 def _tethers(garment: Garment) -> tuple[Any, Any]:
@@ -160,13 +163,10 @@ def _tethers(garment: Garment) -> tuple[Any, Any]:
     return _numbers(far), _integers(np.maximum(pins, 0))
 
 
-def _springs_of(
-    garment: Garment, pairs: NDArray[np.int64], longer: NDArray[np.float64], shorter: NDArray[np.float64]
-) -> Any:
+def _springs_of(garment: Garment, pairs: NDArray[np.int64], compliance: NDArray[np.float64]) -> Any:
     springs = Springs()
-    springs.ends = _of(wp.vec2i, pairs)
+    springs.ends, springs.compliance = _of(wp.vec2i, pairs), _numbers(compliance)
     springs.length = _numbers(garment.lengths(pairs))
-    springs.longer, springs.shorter = _numbers(longer / STEP**2), _numbers(shorter / STEP**2)
     return springs
 
 
@@ -204,11 +204,13 @@ def _nearest_kin(rest: Rest, vertices: NDArray[np.int64], body: Rest, faces: NDA
     return np.asarray(np.take_along_axis(near, best[:, None], axis=1)[:, 0], np.int64)
 
 
-def _masses(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Kilograms [vertex]: a third of each face around it."""
+def _inverse_masses(garment: Garment) -> NDArray[np.float64]:
+    """One over the kilograms of each vertex [vertex], a third of each face around it; 0 of those that are pinned."""
+    vertices, faces = garment.rest.vertices, garment.faces
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     area = np.sqrt((np.cross(second - first, third - first) ** 2).sum(axis=1)) / 2
-    return np.asarray(_DENSITY * np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices)), np.float64)
+    mass = _DENSITY * np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices))
+    return np.where(garment.pinned, 0.0, 1 / mass)
 
 
 def _launch(kernel: Any, size: int, *inputs: Any) -> None:

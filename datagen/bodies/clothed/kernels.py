@@ -12,7 +12,7 @@ STEP = wp.constant(1 / 240)
 """Seconds of a step."""
 _KEPT = wp.constant(0.98)  # of the velocity at each step
 _FASTEST = wp.constant(3.0)  # metres a second
-_FRICTION = wp.constant(0.1)
+_FRICTION = wp.constant(0.2)
 _PASSES = wp.constant(4)  # over the edges, each step
 _GAP = wp.constant(0.003)  # metres between parts
 
@@ -40,12 +40,11 @@ class State:
 
 @wp.struct
 class Springs:
-    """Pairs of vertices that keep their distance at rest: ends, length, compliance over step^2 when longer, shorter."""
+    """Pairs of vertices that keep their distance at rest: ends, length, and compliance over step^2 (0: none)."""
 
     ends: wp.array(dtype=wp.vec2i)
     length: wp.array(dtype=wp.float32)
-    longer: wp.array(dtype=wp.float32)
-    shorter: wp.array(dtype=wp.float32)
+    compliance: wp.array(dtype=wp.float32)
 
 
 @wp.struct
@@ -149,10 +148,7 @@ def _project(springs: Springs, state: State):
         apart = state.place[one] - state.place[other]
         length = wp.length(apart)
         excess = length - springs.length[spring]
-        compliance = springs.longer[spring]
-        if excess < 0.0:
-            compliance = springs.shorter[spring]
-        summed = state.inverse_mass[one] + state.inverse_mass[other] + compliance
+        summed = state.inverse_mass[one] + state.inverse_mass[other] + springs.compliance[spring]
         if length > 1.0e-9 and summed > 0.0:
             move = apart * (excess / (summed * length))
             state.place[one] = state.place[one] - state.inverse_mass[one] * move

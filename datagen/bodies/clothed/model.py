@@ -21,8 +21,8 @@ from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
 
-DRAPING = "4"
-"""To be raised with any change of outfits, cuts or draping that changes bytes: data of two kinds must not mix."""
+DRAPING = Asset("outfits and draping", "Apache-2.0", "4")
+"""To get another version with any change of outfits, cuts or draping that changes bytes: data must not mix."""
 _GRID = 2.0**20
 
 
@@ -67,13 +67,12 @@ class ClothedModel:
         self.parameter_names = (*self._shown.parameter_names, "outfit", "ease")
         self.joints = self._shown.joints
         warp = Asset("warp-lang", "Apache-2.0", importlib.metadata.version("warp-lang"))
-        outfits = Asset("outfits and draping", "Apache-2.0", DRAPING)
         self._outfits = [self._fitted(number) for number in range(len(recipe.outfits))]
         files = (part for outfit in self._outfits for part in outfit if isinstance(part, FittedGarment))
         worn = (
             file_asset(Path(its.recipe.path), licence="as the file's owner states", name=its.where) for its in files
         )
-        self.assets = (*self._shown.assets, warp, outfits, *worn)
+        self.assets = (*self._shown.assets, warp, DRAPING, *worn)
         joints = self._whole.bones.joints
         self._joints = {joint: joints.index(joint) for joint in joints if joint}
         self.person = lru_cache(maxsize=4)(self._person)

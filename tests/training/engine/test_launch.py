@@ -6,6 +6,7 @@ import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -17,6 +18,7 @@ from training.checkpoints.checkpoint import require_checkpoint
 from training.engine import launch
 from training.engine.distributed import STOP_FILE
 from training.recipes.files import recipe_in
+from training.recipes.training import TrainingRecipe
 
 
 class Dying:
@@ -70,6 +72,26 @@ def test_a_rank_whose_disk_is_full_leaves_its_failure_in_the_room_that_is_kept(
         launch.train_rank(told)
     failure = launch.failure_of(tmp_path)
     assert failure is not None and "does not see" in str(failure)
+
+
+@pytest.mark.parametrize("error", [None, TrainingError("a rank's"), RuntimeError("Ray's")], ids=repr)
+def test_room_for_a_failure_is_kept_while_ranks_train(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception | None
+) -> None:
+    kept: list[int] = []
+
+    def fit() -> None:
+        kept.append((tmp_path / ".room").stat().st_size)
+        if error:
+            raise error
+
+    monkeypatch.setattr(launch, "require_enough", lambda *_: None)
+    monkeypatch.setattr(launch, "_count", lambda _: 2)
+    monkeypatch.setattr(launch, "_group", lambda *_, **__: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(launch, "fit_while_progressing", lambda fit, _: fit())
+    with pytest.raises(TrainingError) if error else nullcontext():
+        launch._with_ray(TrainingRecipe(ranks=2, device="cpu"), "data.zarr", tmp_path)
+    assert kept == [2**16] and not (tmp_path / ".room").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """``dsffnet avatar``: recipes that cannot be are refused in one line; scans become an avatar that is animated."""
 
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +12,7 @@ import trimesh
 import yaml
 
 from datagen.bodies import load_body
+from datagen.bodies.clothed.model import DRAPING
 from datagen.common.errors import MeshError, RecipeError
 from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
@@ -21,7 +22,7 @@ from tests.support.commands import command
 from tests.support.shapes.outfits import drawn_outfit, person_arrays, stockinged
 from workflows.avatar.animate import poses_of
 from workflows.avatar.evaluate import Measured, markdown
-from workflows.avatar.outfits import is_draped, is_of, outer_scan, require_people, wearers
+from workflows.avatar.outfits import can_be_draped_again, is_of, outer_scan, require_people, wearers
 from workflows.avatar.recipe import known_avatars, load_avatar
 from workflows.avatar.run import run_avatar
 from workflows.pipeline.run_folder import AvatarFolder
@@ -149,9 +150,19 @@ def test_people_are_called_by_their_outfits_and_numbered_where_two_wear_one() ->
         identities=lambda split: [4, 5, 6, 8] if split == "evaluation" else [0],
         parameters=lambda identity: np.array([0.5, identity % 2, 1.0]),
     )
-    assert wearers(dataset) == {"skirt": 4, "coat": 5, "skirt-2": 6, "skirt-3": 8} and is_draped(dataset)
-    dataset.recipe.body = ClothedBody(method="skinned")
-    assert not is_draped(dataset)
+    assert wearers(dataset) == {"skirt": 4, "coat": 5, "skirt-2": 6, "skirt-3": 8}
+
+
+def test_clothes_are_draped_again_only_as_they_were() -> None:
+    """Else what another version of the simulation does would count as its error."""
+    body = ClothedBody(outfits=("skirt", "coat"))
+    made: dict[str, Any] = {"assets": [asdict(DRAPING)]}
+    dataset: Any = SimpleNamespace(recipe=SimpleNamespace(body=body), attributes={"body": made})
+    assert can_be_draped_again(dataset)
+    made["assets"] = [asdict(replace(DRAPING, version="3"))]
+    assert not can_be_draped_again(dataset)
+    made["assets"], dataset.recipe.body = [asdict(DRAPING)], ClothedBody(method="skinned")
+    assert not can_be_draped_again(dataset)
 
 
 def test_scans_of_another_dataset_are_made_again(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from datagen.store import open_dataset
 from tests.support.commands import ROOT
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
+from training.tracking.record import read_record
 from workflows.cli.main import main
 from workflows.pipeline import own_ray as own_ray_module
 from workflows.pipeline import tasks
@@ -241,23 +242,27 @@ def test_a_process_that_is_ended_within_its_ray_has_last_words(inside: str, stat
     assert said == "" or ended.stderr.endswith("run the same command again to resume\n")
 
 
-def test_a_block_that_heeds_no_interruption_is_ended_with_the_same_words() -> None:
-    """A call to a dead server may wait for ever."""
+def test_a_block_that_heeds_no_interruption_is_ended_with_the_same_words(tmp_path: Any) -> None:
+    """A call to a dead server may wait for ever; what was being made is then no longer recorded as running."""
     script = (
         "import psutil, ray, signal, subprocess, time; ray.init = lambda **_: None\n"
         "from workflows.pipeline import own_ray\n"
         "server = psutil.Process(subprocess.Popen(['sleep', '600']).pid)\n"
         "server.name = lambda: 'raylet'\n"
         "own_ray._family, own_ray._LOOK_SECONDS, own_ray._LEAVE_SECONDS = (lambda: [server]), 0.1, 0.5\n"
+        "import pathlib, sys; from training.tracking.record import begin_record\n"
+        "about = {'name': 'x', 'kind': 'train', 'parent': None, 'parameters': {}}\n"
         "with own_ray.own_ray():\n"
+        "    begin_record(pathlib.Path(sys.argv[1]), **about)\n"
         "    signal.signal(signal.SIGUSR1, signal.SIG_IGN)\n"
         "    server.kill()\n"
         "    time.sleep(600)"
     )
-    ended = subprocess.run(
-        [sys.executable, "-c", script], check=False, cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    ended = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert ended.returncode == ClusterError.exit_status
+    record = read_record(tmp_path)
+    assert record is not None and record.status == "FAILED"
     assert ended.stderr.startswith("error: Ray's raylet has died") and len(ended.stderr.splitlines()) == 1
 
 
