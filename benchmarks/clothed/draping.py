@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from datagen.bodies.clothed.draping import depths
-from datagen.bodies.clothed.model import ClothedModel, body_faces
+from datagen.bodies.clothed.model import DRAPING, ClothedModel, body_faces
 from datagen.bodies.skinning import skin
 from datagen.common.files import write_atomically
 from datagen.common.seeding import Stream, generator
@@ -86,16 +86,18 @@ def sheet(path: Path, people: int, poses: int, subdivide: int) -> None:
 
 def people(folder: Path, count: int, poses: int, subdivide: int) -> None:
     """Random people of all ages, each in every outfit and pose: a picture and figures a person, which are kept."""
+    folder = folder / f"version {DRAPING.version}, {poses} poses, {subdivide} times subdivided"
     folder.mkdir(parents=True, exist_ok=True)
     body = AnnyBody(topology="notoes_collapse5pc", phenotypes=PhenotypeRanges(age=(0, 1)))
     model = ClothedModel(ClothedBody(body=body, detail=subdivide, solver=DrapeSolver(subdivide=subdivide)))
     drawn, begun = draw_poses(PoseRecipe(), range(poses)), time.time()
-    missing = [identity for identity in range(count) if not (folder / f"person-{identity:03d}.json").exists()]
+    paths = [folder / f"person-{identity:03d}" for identity in range(count)]
+    missing = [identity for identity, path in enumerate(paths) if not path.with_suffix(".json").exists()]
     for made, identity in enumerate(missing, 1):
-        _person(model, identity, drawn, folder / f"person-{identity:03d}")
+        _person(model, identity, drawn, paths[identity])
         left = (len(missing) - made) * (time.time() - begun) / made
         print(f"person {identity}: {made} of {len(missing)}, {left / 60:.0f} minutes left", flush=True)
-    found = [json.loads(path.read_text()) for path in sorted(folder.glob("person-*.json"))]
+    found = [json.loads(path.with_suffix(".json").read_text()) for path in paths]
     deep, stretch = (np.array([its[key] for its in found]) for key in ("deep", "stretch"))
     print(f"{len(found)} people, {deep.size} poses, {sum(its['seconds'] for its in found):.0f} CPU s, all finite")
     for outfit, inside, longer in zip(OUTFITS, deep.transpose(1, 0, 2), stretch.transpose(1, 0, 2), strict=True):

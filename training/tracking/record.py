@@ -120,8 +120,8 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         started=before.started if before else _now(),
         id=(before.id if before else "") or uuid.uuid4().hex,
     )
-    write_record(folder, record)
     with _changing:
+        write_record(folder, record)
         _begun.add(folder)
         _failed.discard(folder)
     return record

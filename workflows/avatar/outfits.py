@@ -1,5 +1,6 @@
 """From a dataset of dressed people, or files of scans, to the folders of outfits: body, scans, field, points."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
@@ -10,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from datagen.bodies import load_body
-from datagen.bodies.clothed.model import DRAPING, ClothedModel
-from datagen.common.errors import CheckpointError, RecipeError, UnsafeFileError
+from datagen.bodies.clothed.model import ClothedModel
+from datagen.common.errors import BodyError, CheckpointError, RecipeError, UnsafeFileError
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh
 from datagen.poses import Poses
@@ -30,6 +31,8 @@ from workflows.avatar.recipe import AvatarWorkflow, FieldRecipe, ScanRecipe
 from workflows.pipeline.progress import bar
 from workflows.pipeline.run_folder import AvatarFolder
 from workflows.pipeline.tasks import TaskRunner
+
+log = logging.getLogger(__name__)
 
 MADE = ("subject", "field", "samples", "surfaces")
 """What is made of an outfit before its template is learned, by the names of :class:`training.avatar.outfit.Outfit`."""
@@ -154,13 +157,20 @@ def wearers(dataset: Dataset) -> dict[str, int]:
 
 
 def can_be_draped_again(dataset: Dataset) -> bool:
-    """Whether the clothes of a dataset's people are simulated, and as they would be now."""
+    """Whether the clothes of a dataset's people are simulated, and as they would be now by the body's assets."""
     body = dataset.recipe.body
     if not isinstance(body, ClothedBody) or body.method != "draped":
         return False
-    return any(
-        (its["name"], its["version"]) == (DRAPING.name, DRAPING.version) for its in dataset.attributes["body"]["assets"]
-    )
+    stored = {(its["name"], its["version"]) for its in dataset.attributes["body"]["assets"]}
+    try:
+        changed = {(its.name, its.version) for its in load_body(body).assets} - stored
+    except BodyError as error:  # a garment's file is gone, say
+        changed = {(str(error), "")}
+    if changed:
+        log.warning(
+            "%s is draped otherwise now: no row of the simulation's own error (%s)", dataset.url, sorted(changed)
+        )
+    return not changed
 
 
 def draped_finer(dataset: Dataset, identity: int, frames: Sequence[int]) -> NDArray[np.float32]:

@@ -255,11 +255,11 @@ class _Watch:
         """
         failing = threading.Thread(target=fail_begun, daemon=True)
         failing.start()
+        self._kin += _family()  # of now: children of a parent that dies are nobody's
+        failing.join(_RECORD_SECONDS)  # a disk may hang
         self.words.be(f"error: {self.message}")
         main = threading.main_thread().ident
         assert main is not None
-        self._kin += _family()  # of now: children of a parent that dies are nobody's
-        failing.join(_RECORD_SECONDS)  # a disk may hang
         signal.pthread_kill(main, signal.SIGUSR1)
         if not stop.wait(_LEAVE_SECONDS):
             self.end_kin()

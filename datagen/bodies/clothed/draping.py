@@ -1,7 +1,8 @@
 """Cloth draped over a moving body: extended position-based dynamics in small steps, in Warp's kernels on the CPU.
 
-Macklin et al. 2016 (XPBD) and 2019 (small steps in place of iterations; edges get four a step). Every pose starts at
-the T-pose and follows a fixed path, so that a garment in a pose is a function of identity and pose alone.
+Macklin et al. 2016 (XPBD) and 2019 (small steps in place of iterations; edges get four a step). Edges have no
+compliance, bends one that undoes a share a step; so only ratios of masses matter. Every pose starts at the T-pose and
+follows a fixed path, so that a garment in a pose is a function of identity and pose alone.
 """
 
 from dataclasses import dataclass
@@ -22,11 +23,11 @@ from datagen.recipe import DrapeSolver
 
 _REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
 _FALL, _FALL_LAST = 5.0, 1.0
-"""Metres a second squared at the stations, and after settling.
+"""Metres a second squared at the stations, and at the end of settling.
 
-Cloth that does not stretch hangs the same however light it is, and few steps do not carry the weight of fine cloth.
+Not 9.81, as few steps do not carry the weight of fine cloth: it would hang stretched. Against so little, bending counts
+for more than it would: ``stiffness`` says how folds look, and is no material's constant.
 """
-_DENSITY = 0.2  # kilograms a square metre
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
 _TOGETHER = 10  # steps of settling between two searches for contacts
 _DEEP, _MOST_DEEP = 0.01, 0.05  # metres inside of the body at rest, and the share of vertices that may be
@@ -205,11 +206,11 @@ def _nearest_kin(rest: Rest, vertices: NDArray[np.int64], body: Rest, faces: NDA
 
 
 def _inverse_masses(garment: Garment) -> NDArray[np.float64]:
-    """One over the kilograms of each vertex [vertex], a third of each face around it; 0 of those that are pinned."""
+    """One over the mass of each vertex [vertex], a third of the area around it (m^2); 0 of those that are pinned."""
     vertices, faces = garment.rest.vertices, garment.faces
     first, second, third = (vertices[faces[:, corner]] for corner in range(3))
     area = np.sqrt((np.cross(second - first, third - first) ** 2).sum(axis=1)) / 2
-    mass = _DENSITY * np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices))
+    mass = np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices))
     return np.where(garment.pinned, 0.0, 1 / mass)
 
 

@@ -19,7 +19,7 @@ _GAP = wp.constant(0.003)  # metres between parts
 
 @wp.struct
 class State:
-    """Vertices of cloth: place, place a step ago, velocity, 1 / mass, and planes that each stays outside of.
+    """Vertices of cloth: place, place a step ago, velocity, 1 / mass (area), and planes that each stays outside of.
 
     It keeps ``distance`` from the body's (``contact``, ``normal``), and ``_GAP`` from that of the parts below
     (``under``, ``under_normal``); a normal is zero where there is nothing near. It is at most ``tether`` from ``pin``.
@@ -40,7 +40,7 @@ class State:
 
 @wp.struct
 class Springs:
-    """Pairs of vertices that keep their distance at rest: ends, length, and compliance over step^2 (0: none)."""
+    """Pairs of vertices that keep their distance at rest: ends, length, and compliance over step^2."""
 
     ends: wp.array(dtype=wp.vec2i)
     length: wp.array(dtype=wp.float32)

@@ -79,7 +79,7 @@ def _mixed(folder: Path) -> dict[str, Any]:
 
 
 def _clothed(folder: Path) -> dict[str, Any]:
-    solver = {"frames": 2, "substeps": 1, "settle": 0, "subdivide": 0}
+    solver = {"frames": 2, "substeps": 1, "settle": 21, "subdivide": 0}
     body = {"family": "clothed", "body": _anny(folder)["body"], "outfits": ["skirt", "loose"], "solver": solver}
     return {"body": body, "distribution": NPT}
 

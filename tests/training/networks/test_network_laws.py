@@ -133,12 +133,18 @@ def _ellipsoid(seed: int) -> Tensor:
 @pytest.mark.parametrize("start", [initial, lively])
 @pytest.mark.parametrize("name", WITH_EQUATIONS)
 def test_float32_is_as_exact_as_the_equations_in_float32(name: str, start: Any) -> None:
+    """Rounding, in a box of 2. A few vertices of 3D-CoreNet magnify it (even the exact generator, that of the warped
+    points by 7), others on another CPU; its root mean square is the same on all."""
     network = start(form_of(name), wide=True, **ABLATIONS.get(name, {})).eval()
     inputs = pair_of(name, torch.float32, source=300, target=200)
     found, literal = network(**inputs), literal_of(name, network)(**inputs)
     exact = network.double()(**{key: mesh.double() for key, mesh in inputs.items()})
-    assert (found - exact).abs().max() < 2e-5  # rounding, in a box of 2
-    assert (found - exact).abs().max() < 2 * (literal - exact).abs().max() + (1e-5 if plain(name) == "corenet3d" else 0)
+    error, usual = (found - exact).abs(), (literal - exact).abs()
+    if plain(name) == "corenet3d":
+        assert error.square().mean().sqrt() < min(4e-6, 2 * usual.square().mean().sqrt())
+        assert error.max() < 2 * usual.max() + 1e-5
+    else:
+        assert error.max() < min(2e-5, 2 * usual.max())
 
 
 @pytest.mark.parametrize("name", ALL)

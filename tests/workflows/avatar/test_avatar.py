@@ -13,6 +13,7 @@ import yaml
 
 from datagen.bodies import load_body
 from datagen.bodies.clothed.model import DRAPING
+from datagen.common.assets import Asset
 from datagen.common.errors import MeshError, RecipeError
 from datagen.common.seeding import Stream, generator
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
@@ -153,16 +154,23 @@ def test_people_are_called_by_their_outfits_and_numbered_where_two_wear_one() ->
     assert wearers(dataset) == {"skirt": 4, "coat": 5, "skirt-2": 6, "skirt-3": 8}
 
 
-def test_clothes_are_draped_again_only_as_they_were() -> None:
-    """Else what another version of the simulation does would count as its error."""
-    body = ClothedBody(outfits=("skirt", "coat"))
-    made: dict[str, Any] = {"assets": [asdict(DRAPING)]}
-    dataset: Any = SimpleNamespace(recipe=SimpleNamespace(body=body), attributes={"body": made})
-    assert can_be_draped_again(dataset)
-    made["assets"] = [asdict(replace(DRAPING, version="3"))]
-    assert not can_be_draped_again(dataset)
-    made["assets"], dataset.recipe.body = [asdict(DRAPING)], ClothedBody(method="skinned")
-    assert not can_be_draped_again(dataset)
+def test_clothes_are_draped_again_only_as_they_were(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Else what another version of the simulation, or another garment, does would count as its error."""
+    body, coat = ClothedBody(outfits=("skirt", "coat")), Asset("coat.obj", "CC0-1.0", "a hash")
+    here = SimpleNamespace(assets=(DRAPING, coat))
+    monkeypatch.setattr("workflows.avatar.outfits.load_body", lambda _: here)
+    made: dict[str, Any] = {"assets": [asdict(DRAPING), asdict(coat), asdict(Asset("poses", "MIT", "1"))]}
+    dataset: Any = SimpleNamespace(recipe=SimpleNamespace(body=body), attributes={"body": made}, url="people.zarr")
+    assert can_be_draped_again(dataset) and not caplog.messages
+    for other in (replace(DRAPING, version="3"), coat), (DRAPING, replace(coat, version="another")):
+        here.assets = other
+        assert not can_be_draped_again(dataset)
+        assert "people.zarr is draped otherwise now" in caplog.messages.pop()
+        caplog.clear()
+    here.assets, dataset.recipe.body = (DRAPING, coat), ClothedBody(method="skinned")
+    assert not can_be_draped_again(dataset) and not caplog.messages
 
 
 def test_scans_of_another_dataset_are_made_again(tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ import hashlib, numpy as np
 from datagen.bodies import load_body
 from datagen.recipe import AnnyBody, ClothedBody, DrapeSolver, PoseRecipe
 from datagen.poses import draw_poses
-solver = DrapeSolver(frames=3, substeps=2, settle=10, subdivide=0)
+solver = DrapeSolver(frames=3, substeps=2, settle=30, subdivide=0)
 body = load_body(ClothedBody(body=AnnyBody(topology="notoes_collapse3pc"), outfits=("coat",), solver=solver))
 parameters = body.draw_identity(np.random.default_rng(3), 0)
 print(hashlib.sha256(body.vertices(parameters, draw_poses(PoseRecipe(), range(2))).tobytes()).hexdigest())
