@@ -216,12 +216,14 @@ def _apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["picture", "sheet", "people", "walk", "measure"])
-    parser.add_argument("path", nargs="?", type=Path, default=Path("docs/images/bodies-clothed.png"))
+    parser.add_argument("path", nargs="?", type=Path, help="file, or folder of people; measure takes none")
     parser.add_argument("--identities", type=int, default=3)
     parser.add_argument("--poses", type=int, default=4)
     parser.add_argument("--subdivide", type=int, default=1)
     parser.add_argument("--outfits", nargs="+", choices=list(OUTFITS), default=list(OUTFITS))
     given = parser.parse_args()
+    if given.path is None and given.what != "measure":
+        parser.error(f"{given.what} needs the path that it writes to")
     if given.what == "picture":
         picture(given.path)
     elif given.what == "sheet":
