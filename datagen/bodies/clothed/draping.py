@@ -5,7 +5,7 @@ compliance, bends one that undoes a share a step; so only ratios of masses matte
 follows a fixed path, so that a garment in a pose is a function of identity and pose alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ for more than it would: ``stiffness`` says how folds look, and is no material's 
 _REACH_PARTS = 0.03  # metres within which the parts below are looked for
 _TOGETHER = 10  # steps of settling between two searches for contacts
 _DEEP, _MOST_DEEP = 0.01, 0.05  # metres inside of the body at rest, and the share of vertices that may be
+_TOUCHING = 0.001  # metres inside of it from which a vertex has less ease
 _NEAR, _KIN = 60, 0.02  # triangles that a pin chooses from; the product of weights from which a bone moves both
 _GRID = 2.0**20
 
@@ -129,6 +130,16 @@ def require_outside(garment: Garment, body: Rest, faces: NDArray[np.int64], *, n
             f"{share:.0%} of the vertices of {name} are more than {1000 * _DEEP:.0f} mm inside of the body at rest, "
             f"where {_MOST_DEEP:.0%} can be pushed out. Give its parts under data.body.own a larger ease or flare"
         )
+
+
+def outside(garment: Garment, body: Rest, faces: NDArray[np.int64]) -> Garment:
+    """The garment at rest with less ease where that had put it into the body: a wide sleeve into the ribs beside it."""
+    eased, near = garment.rest.vertices, garment.uneased
+    places = eased
+    for share in (0.75, 0.5, 0.25, 0.0):
+        deep = depths(places.astype(np.float32), body.vertices.astype(np.float32), faces) > _TOUCHING
+        places = np.where(deep[:, None], np.round((near + share * (eased - near)) * _GRID) / _GRID, places)
+    return replace(garment, rest=replace(garment.rest, vertices=places))
 
 
 def _springs(garment: Garment) -> tuple[Any, Any]:

@@ -21,7 +21,7 @@ from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
 
-DRAPING = Asset("outfits and draping", "Apache-2.0", "5")
+DRAPING = Asset("outfits and draping", "Apache-2.0", "6")
 """To get another version with any change of outfits, cuts or draping that changes bytes: data must not mix."""
 _GRID = 2.0**20
 
@@ -159,10 +159,11 @@ class ClothedModel:
             Figure(whole, self._joints), parts, ease=ease, subdivide=solver.subdivide, detail=self._recipe.detail
         )
         body = _some(whole, np.arange(BODY_VERTICES))
-        if self._recipe.method == "draped":
-            from datagen.bodies.clothed.draping import require_outside
+        from datagen.bodies.clothed.draping import outside, require_outside
 
+        if self._recipe.method == "draped":
             require_outside(garment, body, body_faces(), name=f"the outfit {self._recipe.outfits[int(outfit)]!r}")
+        garment = outside(garment, body, body_faces())
         postures = tuple(skin(garment.rest, self._whole.world_rotations(_POSTURES)))
         faces = self._shown.faces(np.array(own))
         seen = faces[~covered(Figure(shown, self._joints), parts)[faces].all(axis=1)]

@@ -50,7 +50,7 @@ def test_the_helper_groups_are_those_of_makehuman() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("number", range(10))
+@pytest.mark.parametrize("number", [*range(10), *(pytest.param(n, marks=pytest.mark.slow) for n in range(10, 50))])
 def test_parts_are_manifold_finite_and_off_the_body(model: ClothedModel, number: int) -> None:
     parameters = identity(model, number)
     person, outfit = model.person(tuple(parameters)), OUTFITS[list(OUTFITS)[number % 5]]
@@ -67,15 +67,29 @@ def test_parts_are_manifold_finite_and_off_the_body(model: ClothedModel, number:
         assert len(borders(mine)) == holes, f"part {part}: waist and hem; neck, sleeves and hem; waist and two legs"
         assert garment.pinned[garment.part == part].any()
     rest = garment.rest.vertices.astype(np.float32)
-    assert depths(rest, person.body.vertices.astype(np.float32), body_faces()).max() < 0.003, "metres within the body"
+    assert depths(rest, person.body.vertices.astype(np.float32), body_faces()).max() < 0.002, "metres within the body"
+
+
+def test_a_wide_sleeve_has_less_ease_where_it_would_be_in_the_ribs(model: ClothedModel) -> None:
+    """Of one of the six of the first fifty people of all ages whose loose shirt was more than 2 mm within them."""
+    person = model.person((*identity(model, 24)[:-2], list(OUTFITS).index("loose"), 1.2))
+    figure, skin_of = Figure(model._whole.rest(identity(model, 24)[:-2]), model._joints), person.body
+    before = garment_of(figure, OUTFITS["loose"], ease=1.2, subdivide=1, detail=1)
+    body = skin_of.vertices.astype(np.float32)
+    deep = depths(before.rest.vertices.astype(np.float32), body, body_faces())
+    changed = (person.garment.rest.vertices != before.rest.vertices).any(axis=1)
+    assert deep.max() > 0.005 and changed[deep > 0.002].all() and changed.mean() < 0.1
+    assert depths(person.garment.rest.vertices.astype(np.float32), body, body_faces()).max() < 0.002
 
 
 def test_hems_are_level(model: ClothedModel) -> None:
     parameters = np.array([0.5, 0.3, 0.5, 0.5, 0.5, 0.5])  # a child
     figure = Figure(model._whole.rest(parameters), model._joints)
     garment = garment_of(figure, [GarmentPart(low=0.4, high=2.9, ease=0.0)], ease=1.0, subdivide=0, detail=0)
-    rings = [garment.rest.vertices[ring, 1] for ring in borders(garment.faces)]
-    assert len(rings) == 3 and all(np.ptp(ring) < 0.004 for ring in rings), "but for what a normal leans"
+    rings = borders(garment.faces)
+    assert len(rings) == 3
+    assert all(np.ptp(garment.uneased[ring, 1]) < 1e-6 for ring in rings), "as cut"
+    assert all(np.ptp(garment.rest.vertices[ring, 1]) < 0.004 for ring in rings), "but for what a normal leans"
 
 
 def test_a_childs_skirt_does_not_hang_on_its_hands(model: ClothedModel) -> None:
