@@ -37,7 +37,16 @@ def _store(empty_store: Path) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _agents() -> Iterator[None]:
+    """What may wait a minute is waited for once, while all tests run."""
+    yield
+    _, alive = psutil.wait_procs(AGENTS, timeout=120)
+    assert not alive, [process.cmdline() for process in alive]
+
+
 STORE: dict[str, Path] = {}
+AGENTS: list[psutil.Process] = []
 ENDED = "error: this process has been ended in the middle"
 
 
@@ -73,8 +82,17 @@ def on_ray(out: Path) -> tuple[str, ...]:
 
 def wait_until_gone(processes: list[psutil.Process]) -> None:
     """Ray's agents wait a minute for the store of a driver that was killed; all else goes with it."""
-    _, alive = psutil.wait_procs(processes, timeout=120)
+    agents = [process for process in processes if is_agent(process)]
+    AGENTS.extend(agents)
+    _, alive = psutil.wait_procs([process for process in processes if process not in agents], timeout=60)
     assert not alive, [process.cmdline() for process in alive]
+
+
+def is_agent(process: psutil.Process) -> bool:
+    try:
+        return process.name().endswith("Agent")
+    except psutil.Error:
+        return False
 
 
 def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 200) -> None:
