@@ -5,7 +5,7 @@ order and equivariant to the target's. The generator of 3D-CoreNet has a kernel 
 vertices: it learns from the order that a body model happens to list them in, unless they are shuffled.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,28 +15,34 @@ from torch import Tensor
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
 from training.data.proportions import of_other_proportions
+from training.data.rig_table import RigTable
 from training.data.triples import Triples
-from training.networks.layers.rigid_parts import about_vertical
+from training.networks.layers.rigid_parts import about_vertical, turned_about
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
 from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingRecipe
-
-Supervise = Callable[[Triples, Batch], Batch]
 
 
 class Augmentation:
     """The augmentation of a recipe, a function of (seed, step, place of the triple in the whole batch).
 
     So it is the same for any number of ranks and parts and from any cache. A CPU and a GPU draw different numbers.
+
+    Parameters
+    ----------
+    recipe
+        Of the training.
+    rigs
+        What a network that learns from rigs is told; None: nothing but vertices.
     """
 
-    def __init__(self, recipe: TrainingRecipe, supervise: Supervise = lambda triples, batch: batch) -> None:
-        self._recipe, self._seed, self._supervise = recipe.augmentation, recipe.seed, supervise
+    def __init__(self, recipe: TrainingRecipe, rigs: RigTable | None = None) -> None:
+        self._recipe, self._seed, self._rigs = recipe.augmentation, recipe.seed, rigs
         self._network = recipe.network
         self._draws_edges = not isinstance(recipe.network, PartsRecipe)  # it has no edge loss
 
     def __call__(self, triples: Triples, batch: Batch, *, step: int, first: int) -> Batch:
-        """The batch changed: turned, cut, thinned; told of its rigs; then of other proportions, and noisy.
+        """The batch changed: as points, turned, cut, thinned; told of its rigs; then of other proportions, and noisy.
 
         Parameters
         ----------
@@ -49,17 +55,19 @@ class Augmentation:
         """
         recipe, device = self._recipe, batch.source.device
         if recipe == AugmentationRecipe(shuffle=recipe.shuffle):
-            return self._supervise(triples, batch)
+            return self._told(triples, batch)
         random = [_generator(self._seed, step, first + row, device) for row in range(len(batch))]
-        if recipe.turn:
-            batch = _turned(batch, np.radians(recipe.turn), random)
+        if recipe.points and self._rigs:
+            batch = self._rigs.of_points(triples, batch, recipe.points, random)
+        if recipe.turn or recipe.lean:
+            batch = _turned(batch, np.radians(recipe.turn), np.radians(recipe.lean), random)
         if recipe.source_holes:
             batch = _cut(batch, recipe.source_holes, random)
         if recipe.vertices < 1:
             batch = _some_of_the_source(batch, recipe.vertices, random)
         if recipe.subset:
             batch = self._subset(batch, recipe.subset, random)
-        batch = self._supervise(triples, batch)
+        batch = self._told(triples, batch)
         if batch.surfaces:
             batch = _without_some_surfaces(batch, random)
         if recipe.proportions and isinstance(self._network, PartsRecipe):
@@ -67,6 +75,9 @@ class Augmentation:
         if recipe.source_noise:
             batch = _noisy(batch, recipe.source_noise, random)
         return batch
+
+    def _told(self, triples: Triples, batch: Batch) -> Batch:
+        return self._rigs.posed(triples, batch) if self._rigs else batch
 
     def _subset(self, batch: Batch, size: int, random: Sequence[torch.Generator]) -> Batch:
         """So many vertices of each source and each target; more often than once where a mesh has fewer."""
@@ -162,7 +173,7 @@ def _of_rows(batch: Batch, rows: Sequence[Tensor]) -> Batch:
 def _cut(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
     """Each source without what lies about one of its vertices, boxed by what is left."""
     device = batch.source.device
-    shares = (most * torch.stack([torch.rand((), generator=own, device=device) for own in random])).tolist()
+    shares = (most * torch.stack([torch.rand((), generator=own, device=device) for own in random]) ** 3).tolist()
     rows = []
     for mesh, count, share, own in zip(batch.source, _counts(batch), shares, random, strict=True):
         middle = mesh[torch.randint(count, (1,), generator=own, device=device)]
@@ -188,11 +199,17 @@ def _noisy(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batc
     return replace(batch, source=source)
 
 
-def _turned(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
-    """Source and target each turned about the vertical, the truth as the source; all in their new boxes."""
+def _turned(batch: Batch, most: float, lean: float, random: Sequence[torch.Generator]) -> Batch:
+    """Source and target each turned about the vertical, then tilted, the truth as the source; in their new boxes."""
     device = batch.source.device
     angles = torch.stack([torch.rand(2, generator=own, device=device) for own in random]) * 2 - 1
-    turns = about_vertical(torch.cos(most * angles), torch.sin(most * angles)).to(batch.source.dtype)
+    turns = about_vertical(torch.cos(most * angles), torch.sin(most * angles))
+    if lean:
+        side, amount = torch.stack([torch.rand((2, 2), generator=own, device=device) for own in random]).unbind(2)
+        towards = torch.stack([(2 * np.pi * side).cos(), torch.zeros_like(side), (2 * np.pi * side).sin()], dim=2)
+        tilts = turned_about((lean * amount.square()[..., None] * towards).flatten(0, 1))
+        turns = tilts.view_as(turns) @ turns
+    turns = turns.to(batch.source.dtype)
     source, target = turns.unbind(1)
     return replace(
         batch,

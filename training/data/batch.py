@@ -12,6 +12,7 @@ from torch import Tensor
 from datagen.common.errors import DatasetError
 from datagen.mesh.geometry import edges_of
 from datagen.store import Dataset
+from training.data.surface_points import SurfacePoints
 from training.data.triples import Triples
 from training.data.vertex_layout import normalised, read_each
 from training.networks.layers.surface import Surface, joined, surface_of
@@ -36,11 +37,13 @@ class Batch:
         Vertices of each mesh, for :class:`training.networks.padded_batches.MixedCounts`; None: all n. The truth has the
         target's.
     source_rows, target_rows
-        ``[b, n]``, numbers of the vertices that were taken of each mesh; None: all.
+        ``[b, n]``, numbers of the vertices that were taken of each mesh, or of its points; None: all.
     posed
         Of a network that learns from rigs: how the sources are posed, and the targets.
     surfaces
         What is near along the surfaces of the sources, and of the targets, for a network that asks; None: not known.
+    points
+        Of which points of their surfaces the sources and the targets are made, in the place of vertices; None: of none.
     """
 
     source: Tensor
@@ -53,6 +56,7 @@ class Batch:
     target_rows: Tensor | None = None
     posed: tuple[Posed, Posed] | None = None
     surfaces: tuple[Surface, Surface] | None = None
+    points: tuple[SurfacePoints, SurfacePoints] | None = None
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
         """The same on another device."""
@@ -64,8 +68,9 @@ class Batch:
         )
         posed = self.posed and (self.posed[0].to(device), self.posed[1].to(device))
         surfaces = self.surfaces and (self.surfaces[0].to(device), self.surfaces[1].to(device))
+        points = self.points and (self.points[0].to(device), self.points[1].to(device))
         counts = self.source_counts, self.target_counts
-        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed, surfaces)
+        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed, surfaces, points)
 
     def __len__(self) -> int:
         return len(self.source)

@@ -16,6 +16,7 @@ from datagen.mesh.geometry import edges_of
 from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
 from datagen.store import Dataset
 from training.data.batch import Batch
+from training.data.surface_points import SurfacePoints, Triangles, points_of
 from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers import rigid_parts
@@ -67,41 +68,81 @@ class RigTable:
         self._world = torch.from_numpy(world[:, chosen].astype(np.float32)).to(device)
         self._device, self._row = torch.device(device), dict[int, int]()
         weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
-        surfaces = list[Surface]()
+        surfaces, triangles = list[Surface](), list[Triangles]()
         kinds, known = list[int](), dict[bytes, int]()
         for identity in identities:
             its_weights, its_rest, its_joints = self._of_identity(int(identity))
             kind = known.setdefault(its_weights.tobytes(), len(known))
             if kind == len(weights):
                 weights.append(torch.from_numpy(its_weights).to(device))
-                surfaces.append(surface_of(its_rest, edges_of(dataset.faces(int(identity)))))
+                faces = dataset.faces(int(identity))
+                surfaces.append(surface_of(its_rest, edges_of(faces)))
+                triangles.append(Triangles(its_rest, faces, device=self._device))
             kinds.append(kind)
             rest.append(torch.from_numpy(its_rest).to(device))
             at.append(its_joints)
             self._row[int(identity)] = len(rest) - 1
-        self._weights, self._rest, self._kinds = weights, rest, kinds
+        self._weights, self._rest, self._kinds, self._triangles = weights, rest, kinds, triangles
         self._surfaces = joined(surfaces).to(device)
         self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
         self._joints = torch.from_numpy(np.stack(at)).to(device)
 
     def posed(self, triples: Triples, batch: Batch) -> Batch:
         """The batch of rows (source identity, source pose, target identity, target pose), with what the rigs say."""
-        sources = self._of(triples[:, 0], triples[:, 1], batch.source, batch.source_rows)
-        targets = self._of(triples[:, 2], triples[:, 3], batch.target, batch.target_rows)
+        of_source, of_target = batch.points or (None, None)
+        sources = self._of(triples[:, 0], triples[:, 1], batch.source, batch.source_rows, of_source)
+        targets = self._of(triples[:, 2], triples[:, 3], batch.target, batch.target_rows, of_target)
         surfaces = (
-            self._surface(triples[:, 0], batch.source, batch.source_rows),
-            self._surface(triples[:, 2], batch.target, batch.target_rows),
+            self._surface(triples[:, 0], batch.source, batch.source_rows, of_source),
+            self._surface(triples[:, 2], batch.target, batch.target_rows, of_target),
         )
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
-    def _surface(self, identities: NDArray[np.integer], vertices: Tensor, rows: Tensor | None) -> Surface:
+    def of_points(self, triples: Triples, batch: Batch, chance: float, random: Sequence[torch.Generator]) -> Batch:
+        """The batch, each source and each target (with its truth) with this chance as points of its surface."""
+        drawn = [
+            points_of(
+                [self._triangles[self._kinds[self._row[int(identity)]]] for identity in identities],
+                counts or (meshes.shape[1],) * len(meshes),
+                meshes.shape[1],
+                chance,
+                random,
+            )
+            for identities, meshes, counts in (
+                (triples[:, 0], batch.source, batch.source_counts),
+                (triples[:, 2], batch.target, batch.target_counts),
+            )
+        ]
+        source, target = drawn
+        return replace(
+            batch,
+            source=source.of(batch.source),
+            target=target.of(batch.target),
+            truth=target.of(batch.truth),
+            points=(source, target),
+        )
+
+    def _surface(
+        self,
+        identities: NDArray[np.integer],
+        vertices: Tensor,
+        rows: Tensor | None,
+        points: SurfacePoints | None,
+    ) -> Surface:
         """The surfaces of meshes of these identities; a pose does not change what is near along them."""
         kinds = sent(torch.tensor([self._kinds[self._row[int(identity)]] for identity in identities]), self._device)
         cells, near = (each.index_select(0, kinds) for each in self._surfaces)
+        if points is not None:
+            cells = cells.gather(1, points.corners[..., 0])
         return Surface(cells[:, : vertices.shape[1]], near) if rows is None else Surface(cells, near).at(rows)
 
     def _of(
-        self, identities: NDArray[np.integer], poses: NDArray[np.integer], vertices: Tensor, rows: Tensor | None
+        self,
+        identities: NDArray[np.integer],
+        poses: NDArray[np.integer],
+        vertices: Tensor,
+        rows: Tensor | None,
+        points: SurfacePoints | None,
     ) -> Posed:
         """How meshes of these identities and poses are posed.
 
@@ -110,17 +151,31 @@ class RigTable:
         vertices
             [b, n, 3] in each mesh' box: those that the step takes.
         rows
-            [b, n], their numbers in the mesh; None: all.
+            [b, n], their numbers in the mesh, or among its points; None: all.
+        points
+            Of the meshes, where they are made of some in the place of vertices.
         """
         own = [self._row[int(identity)] for identity in identities]
         rows = torch.arange(vertices.shape[1]).expand(len(own), -1) if rows is None else rows
-        weights = torch.stack([self._weights[self._kinds[row]][kept] for row, kept in zip(own, rows, strict=True)])
-        rest = torch.stack([self._rest[row][kept] for row, kept in zip(own, rows, strict=True)])
+
+        def told(values: Sequence[Tensor]) -> Tensor:
+            """Of each mesh the values [n, c] where its vertices lie, by those at all of its topology [v, c]."""
+            each = zip(values, rows, strict=True)
+            if points is None:
+                return torch.stack([own[kept] for own, kept in each])
+            return torch.stack([points.at(mesh, kept).of(own)[0] for mesh, (own, kept) in enumerate(each)])
+
+        all_weights, all_rest = [self._weights[self._kinds[row]] for row in own], [self._rest[row] for row in own]
+        weights, rest = told(all_weights), told(all_rest)
         turns = self._world.index_select(0, sent(torch.from_numpy(np.asarray(poses, np.int64)), self._device))
         numbers = sent(torch.tensor(own), self._device)
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
-        posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
+        if points is None:
+            posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
+        else:  # those of the posed triangles, not of the body at rest
+            bodies = zip(all_rest, all_weights, turns, joints, moved, strict=True)
+            posed = told([rigid_parts.skinned(*(each[None] for each in body))[0] for body in bodies])
         return Posed(weights, rest, joints, *_carried(posed, vertices, turns, moved), present)
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -166,14 +221,11 @@ class RigTable:
 def _carried(posed: Tensor, vertices: Tensor, turns: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations and joints in the axes and the box of vertices [b, n, 3], which are those posed [b, n, 3] elsewhere.
 
-    The two differ by a turn about the vertical, a scale and a shift, which are found from the vertices themselves.
+    The two differ by a turn, a scale and a shift, which are found from the vertices themselves.
     """
     middle, there = posed.mean(dim=1, keepdim=True), vertices.mean(dim=1, keepdim=True)
     one, other = posed - middle, vertices - there
-    crossed = one.mT @ other
-    cosine, sine = crossed[:, 0, 0] + crossed[:, 2, 2], crossed[:, 2, 0] - crossed[:, 0, 2]
-    size = torch.sqrt(cosine.square() + sine.square()).clamp_min(1e-12)
-    turn = rigid_parts.about_vertical(cosine / size, sine / size)
+    turn = rigid_parts.nearest_rotations(other.mT @ one)
     scale = ((one @ turn.mT) * other).sum((1, 2)) / one.square().sum((1, 2)).clamp_min(1e-12)
     moved = (joints - middle) @ turn.mT * scale[:, None, None] + there
     return turn[:, None] @ turns, moved

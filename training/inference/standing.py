@@ -23,8 +23,8 @@ from training.networks.layers.sampling import Sample, sample
 from training.networks.parts import Parts
 
 Understanding = Callable[[Floats], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Meshes [b, n, 3] in the normalised box -> how badly [b] each is understood (misfit), and the angle [b] about the
-vertical, in radians from +Z to +X, that it faces by."""
+"""Meshes [b, n, 3] in the normalised box -> how badly [b] each is understood (misfit), and how its root is turned from
+rest [b, 3, 3]."""
 
 
 def understanding_of(network: Parts) -> Understanding:
@@ -34,8 +34,8 @@ def understanding_of(network: Parts) -> Understanding:
     def understand(meshes: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         parts = torch.split(torch.from_numpy(np.ascontiguousarray(meshes, np.float32)), _MESHES_AT_ONCE)
         found = [network.understood(part.to(device)) for part in parts]
-        misfits, facings = (torch.cat(each).double().cpu().numpy() for each in zip(*found, strict=True))
-        return misfits, facings
+        misfits, roots = (torch.cat(each).double().cpu().numpy() for each in zip(*found, strict=True))
+        return misfits, roots
 
     return understand
 
@@ -46,6 +46,7 @@ animals that were read rightly have 8 at most, all else but for two things more 
 KNOWN = 0.003
 """Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
+_UPRIGHT = np.radians(12.0)  # so far a root may lean for a pose, where a mesh stands along its axes
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -89,7 +90,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
     the best. Another way is taken where it is clearly better understood, one between the mesh' axes where it is clearly
-    better than all along them.
+    better than all along them or the root leans in the best of those: nothing but the body says which way is up then,
+    so its root is brought to rest.
 
     Parameters
     ----------
@@ -99,34 +101,50 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     probe = _probe(mesh)
 
     def seen(ways: Sequence[NDArray[np.float64]]) -> list[_Seen]:
-        misfits, facings = understand(np.stack([_boxed(probe @ way.T) for way in ways]))
-        return [_Seen(way, float(m), float(f)) for way, m, f in zip(ways, misfits, facings, strict=True)]
+        misfits, roots = understand(np.stack([_boxed(probe @ way.T) for way in ways]))
+        return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
 
-    def faced(found: _Seen) -> Standing:
-        """The way turned about the vertical until the body faces +Z, as far as the network can say."""
+    def turned(found: _Seen, undone: Callable[[_Seen], NDArray[np.float64]]) -> _Seen:
+        """The way turned by what undoes the root's turn, as far as the network can say."""
         for _ in range(_TURNS):
-            found = seen([_about_vertical(-found.facing) @ found.way])[0]
-        return Standing(found.way, found.misfit)
+            found = seen([undone(found) @ found.way])[0]
+        return found
+
+    def faced(found: _Seen) -> _Seen:
+        """The way turned about the vertical until the body faces +Z."""
+        return turned(found, lambda seen: _about_vertical(-seen.facing))
 
     as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
     if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
-        return faced(as_it_is) if abs(as_it_is.facing) > _STRAIGHT else Standing(np.eye(3), as_it_is.misfit)
+        return faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     if best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
-        return faced(best)
+        return faced(best).stands
     every = seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES])
     along_axes, best = (min(some, key=lambda way: way.misfit) for some in (every[: _SIDES * len(_ANGLES)], every))
     for size in _TILTS:
-        turned = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
-        best = min(seen([best.way, *turned]), key=lambda way: way.misfit)
-    found = faced(along_axes if along_axes.misfit <= _CLEARLY * best.misfit else best)
-    return found if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
+        tilted = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
+        best = min(seen([best.way, *tilted]), key=lambda way: way.misfit)
+    found = faced(along_axes)
+    if along_axes.misfit > _CLEARLY * best.misfit or found.leaning > _UPRIGHT:
+        found = turned(best, lambda seen: seen.root.T)
+    return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
 
 
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the turn about the vertical [3, 3] by which a body with Y up faces: ``before`` but for a clear change."""
-    angle = float(understand(_boxed(_probe(vertices) @ before)[None])[1][0])
-    return _about_vertical(angle) @ before if abs(angle) > _STRAIGHT else before
+    """Return the turn [3, 3] of a body with Y up from upright and facing +Z: ``before`` but for a clear change.
+
+    That is about the vertical, or about any axis where the body clearly leans.
+    """
+    probe = _probe(vertices)
+    for _ in range(_TURNS):
+        root = understand(_boxed(probe @ before)[None])[1][0]
+        if _leaning(root) > _UPRIGHT:
+            before = before @ root
+        else:
+            angle = _facing(root)
+            return before @ _about_vertical(angle) if abs(angle) > _STRAIGHT else before
+    return before
 
 
 def misfit(understand: Understanding, vertices: Floats) -> float:
@@ -149,11 +167,33 @@ def sampled(network: Parts, mesh: Mesh) -> Sample:
 
 
 class _Seen(NamedTuple):
-    """A way to turn a mesh [3, 3], and how it is understood then."""
+    """A way to turn a mesh [3, 3], how it is understood then, and how its root is turned from rest [3, 3]."""
 
     way: NDArray[np.float64]
     misfit: float
-    facing: float
+    root: NDArray[np.float64]
+
+    @property
+    def facing(self) -> float:
+        return _facing(self.root)
+
+    @property
+    def leaning(self) -> float:
+        return _leaning(self.root)
+
+    @property
+    def stands(self) -> Standing:
+        return Standing(self.way, self.misfit)
+
+
+def _facing(root: NDArray[np.float64]) -> float:
+    """The angle of a rotation [3, 3] about the vertical, in radians from +Z to +X."""
+    return float(np.arctan2(root[0, 2] - root[2, 0], root[0, 0] + root[2, 2]))
+
+
+def _leaning(root: NDArray[np.float64]) -> float:
+    """The angle between what a rotation [3, 3] makes of the vertical and the vertical, in radians."""
+    return float(np.arccos(np.clip(root[1, 1], -1, 1)))
 
 
 def _upward() -> list[NDArray[np.float64]]:

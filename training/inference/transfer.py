@@ -201,13 +201,14 @@ class PoseTransfer:
         return rest_error(self._parts, mesh)
 
     def _turned_round(self, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The turn about the vertical [3, 3] by which a frame faces, if the network can say; ``before``: the last."""
+        """The turn [3, 3] of a body from upright, facing +Z, if the network can say; ``before``: the last frame's."""
         return facing(understanding_of(self._network), vertices, before) if isinstance(self._network, Parts) else before
 
     def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Stands) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up."""
         trajectory: RootTrajectory | None = None
         turn, surfaces, first = np.eye(3), dict[str, Surface](), None
+        own = target.vertices @ self._turned_round(target.vertices, np.eye(3))  # what its own pose adds does not matter
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
             axes = axes or self.standing(mesh.vertices)  # that of the first frame: the others may turn round
@@ -216,7 +217,7 @@ class PoseTransfer:
                 first = mesh
                 surfaces = surfaces_of(self._network, sources=[Mesh(vertices, mesh.faces)], targets=[target])
             turn = self._turned_round(vertices, turn)
-            output = self.vertices(vertices @ turn, target.vertices, **surfaces) @ turn.T
+            output = self.vertices(vertices @ turn, own, **surfaces) @ turn.T
             trajectory = trajectory or RootTrajectory.from_first(vertices, scale_of(target, output))
             yield placed(target, output) + trajectory.offset(vertices)
 

@@ -30,13 +30,11 @@ from training.networks.layers.rigid_parts import (
     rotations_from_six,
     skinned,
 )
-from training.networks.layers.sampling import Sample, nearness, offsets, sample, taken, with_masses
+from training.networks.layers.sampling import Sample, nearness, offset, offsets, sample, taken, with_masses
 from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
-_SHARPNESS = 2.0
-"""Power of the weights that vertices are posed by: the network's smear over its doubts."""
 
 
 class Reading(NamedTuple):
@@ -125,8 +123,8 @@ class Parts(nn.Module):
     ) -> Tensor:
         """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
 
-        Outside of training mode weights are sharpened, and the output is read in its turn: errors in reading that
-        source and output share, being in one pose, cancel in the correction. One that is no better is not taken.
+        Outside of training mode the output is read in its turn: errors in reading that source and output share, being
+        in one pose, cancel in the correction. One that is no better is not taken.
 
         Parameters
         ----------
@@ -156,15 +154,14 @@ class Parts(nn.Module):
 
     @torch.no_grad()
     def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how badly meshes [b, n, 3] are understood, and which way they face.
+        """Return how badly meshes [b, n, 3] are understood, and how they are turned.
 
         Returns
         -------
         tuple
             The misfit [b]: what is left where each part is its rest, turned; a mean of squares over the surface, in the
             mesh' box. A mesh that stands as in training leaves little, one that lies on its side or is no body of the
-            kind that was learned leaves much. And the angle [b] of the root's turn about the vertical, in radians from
-            +Z to +X.
+            kind that was learned leaves much. And the rotation [b, 3, 3] of the root from rest.
         """
         with full_precision(vertices):
             drawn = sample(vertices)
@@ -175,9 +172,7 @@ class Parts(nn.Module):
                 (moments.mass * each).sum(1) for each in (fits, moments.squares_at_rest, moments.squares)
             )
             misfit = all_of_it - fit.clamp_min(0).square() / rest.clamp_min(1e-12)
-            root = reading.rotations[:, 0]
-            facing = torch.atan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2])
-            return misfit / moments.mass.sum(1).clamp_min(1e-12), facing
+            return misfit / moments.mass.sum(1).clamp_min(1e-12), reading.rotations[:, 0]
 
     @torch.no_grad()
     def rest_error(self, reading: Reading, drawn: Sample) -> Tensor:
@@ -188,15 +183,14 @@ class Parts(nn.Module):
         degrees, whatever it wears; what is no body makes another mesh at rest than the network took it for.
         """
         with full_precision(drawn.vertices):
-            weights = (_SHARPNESS * reading.logits).softmax(2)
-            at_rest = self.posed(drawn.vertices, weights, reading.joints, reading.rotations.mT)
+            at_rest = self.posed(drawn.vertices, reading.logits.softmax(2), reading.joints, reading.rotations.mT)
             found = self._read_again(at_rest, drawn).rotations
             cosine = (found.diagonal(dim1=2, dim2=3).sum(2) - 1) / 2
             return torch.rad2deg(cosine.clamp(-1, 1).acos()).square().mean(1).sqrt()
 
     def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
-        """Return the weights [b, n, part] by which vertices [b, n, 3] are posed, more certain than as they are read."""
-        return (_SHARPNESS * self.part(self._features(vertices, drawn))).softmax(2)
+        """Return the weights [b, n, part] by which vertices [b, n, 3] are posed."""
+        return self.part(self._features(vertices, drawn)).softmax(2)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -222,7 +216,7 @@ class Parts(nn.Module):
     def _corrected(self, source: Sample, target: Tensor, drawn: Sample) -> Tensor:
         wanted = self.read(source.vertices, source).rotations
         own = self.read(target, drawn)
-        weights = (_SHARPNESS * own.logits).softmax(2)
+        weights = own.logits.softmax(2)
         turns = wanted @ own.rotations.mT
 
         def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
@@ -242,35 +236,47 @@ class Parts(nn.Module):
 
     def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
-        of_sample = _OfSample()
-        features = self._passed(drawn.vertices, drawn.near, drawn, of_sample)
+        of_sample, told = _OfSample(), list[Tensor]()
+        masses = drawn.masses[..., None]
+        every = 1 / (drawn.near @ masses).clamp_min(1e-9)
+
+        def around_sample(layer: Around, features: Tensor) -> Tensor:
+            told.append(layer.told(features))
+            return every * (drawn.near @ (masses * told[-1]))
+
+        away = offsets(drawn.vertices, drawn.near, drawn)
+        features = self._passed(drawn.vertices, away, around_sample, drawn, of_sample)
         if vertices is drawn.vertices:
             return features
-        return torch.cat(
-            [self._passed(some, near, drawn, of_sample.again()) for some, near in nearness(vertices, drawn)], dim=1
-        )
+        every_told = masses * torch.cat([*told, drawn.vertices, torch.ones_like(masses)], dim=2)
+        passed = list[Tensor]()
+        for some, near in nearness(vertices, drawn):
+            sums = near @ every_told
+            mass = sums[..., -1:].clamp_min(1e-9)
+            heard = iter([sums[..., at : at + _TOLD] / mass for at in range(0, _ROUNDS * _TOLD, _TOLD)])
+            away = offset(some, sums[..., -4:-1] / mass)
+            passed.append(self._passed(some, away, lambda *_, heard=heard: next(heard), drawn, of_sample.again()))
+        return torch.cat(passed, dim=1)
 
-    def _passed(self, vertices: Tensor, near: Tensor, drawn: Sample, of_sample: _OfSample) -> Tensor:
+    def _passed(self, vertices: Tensor, away: Tensor, around: _Hearing, drawn: Sample, of_sample: _OfSample) -> Tensor:
+        """Features [b, n, width] of vertices, ``away`` being their offsets and ``around`` what is heard around them."""
+
         def normed(outputs: Tensor, shift: Tensor | float = 0) -> Tensor:
             mean, scale = of_sample(_statistics, outputs, drawn.masses)
             return torch.relu((outputs - mean) * scale + shift)
 
-        masses = drawn.masses[..., None]
-        every = 1 / (near @ masses).clamp_min(1e-9)
-
         def mixed(features: Tensor, layer: nn.Module) -> Tensor:
             assert isinstance(layer, Around)
-            around = every * (near @ (masses * of_sample(layer.told, features)))
-            return features + layer.change(normed(layer.mixed(torch.cat([features, around], dim=2))))
+            heard = around(layer, features)
+            return features + layer.change(normed(layer.mixed(torch.cat([features, heard], dim=2))))
 
         first, second = self.mix
-        features = normed(self.lift(torch.cat([vertices, offsets(vertices, near, drawn)], dim=2)))
+        features = normed(self.lift(torch.cat([vertices, away], dim=2)))
         features = mixed(normed(self.features(features)), self.around[0])
         whole = of_sample(self._whole, features, drawn.masses)
         features = mixed(normed(first(features), whole), self.around[1])
         features = mixed(normed(second(features)), self.around[2])
-        features = mixed(features, self.around[3])
-        return features
+        return mixed(features, self.around[3])
 
     def _whole(self, features: Tensor, masses: Tensor) -> Tensor:
         whole = torch.relu(self.whole(features)).masked_fill(masses[..., None] == 0, 0).amax(dim=1)
@@ -330,6 +336,7 @@ class _OfSample:
 
 
 _Known = TypeVar("_Known")
+_Hearing = Callable[["Around", Tensor], Tensor]
 
 
 def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:

@@ -121,7 +121,11 @@ class AugmentationRecipe(Frozen):
         1.0, gt=0, le=1, description="fraction of the source's vertices that the network sees, another subset each time"
     )
     source_holes: float = Field(
-        0.0, ge=0, lt=1, description="largest share of the source's vertices that is cut out around one of them"
+        0.0,
+        ge=0,
+        lt=1,
+        description="largest share of the source's vertices that is cut out around one of them, another each time, "
+        "small ones more often",
     )
     source_noise: float = Field(
         0.0,
@@ -142,12 +146,26 @@ class AugmentationRecipe(Frozen):
         le=180,
         description="degrees that source and target are turned about the vertical at most, each its own",
     )
+    lean: float = Field(
+        0.0,
+        ge=0,
+        le=90,
+        description="degrees that source and target are tilted at most, to any side, each its own; small tilts more "
+        "often",
+    )
     proportions: float = Field(
         0.0,
         ge=0,
         le=1,
         description="network parts: standard deviation of the logarithm of the factors by which the bodies' parts are "
         "made larger or smaller, in half of the triples, by chance",
+    )
+    points: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="network parts: share of the sources, and of the targets, that are made of random points of their "
+        "surfaces, even by area, in the place of vertices",
     )
     shuffle: bool = Field(
         False,
@@ -277,11 +295,12 @@ class TrainingRecipe(Frozen):
             )
         if subset and kept < 1:
             raise ValueError("augmentation.subset and augmentation.vertices both leave vertices out: take one away")
-        if self.augmentation.proportions and not isinstance(self.network, PartsRecipe):
-            raise ValueError(
-                f"augmentation.proportions needs the parts that network 'parts' is told of, but the network is "
-                f"{self.network.name!r}: set augmentation.proportions to 0"
-            )
+        for name in ("proportions", "points"):
+            if getattr(self.augmentation, name) and not isinstance(self.network, PartsRecipe):
+                raise ValueError(
+                    f"augmentation.{name} needs the rigs that network 'parts' is told of, but the network is "
+                    f"{self.network.name!r}: set augmentation.{name} to 0"
+                )
         self._refuse_what_parts_does_not_know()
         self._refuse_what_avatars_do_not_know()
         if self.early_stopping and self.steps and self.evaluate_every >= self.steps:

@@ -88,7 +88,7 @@ def test_a_batch_is_told_of_its_rigs_before_its_bodies_change_and_made_noisy_aft
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     about: dict[str, float] = {"subset": 24, "turn": 25, "source_holes": 0.3, "proportions": 0.3}
     quiet, noisy = (
-        Augmentation(tiny_training(**{**PARTS, "augmentation": {**about, **more}}), table.posed)(
+        Augmentation(tiny_training(**{**PARTS, "augmentation": {**about, **more}}), table)(
             TRIPLES, batch, step=1, first=0
         )
         for more in ({}, {"source_noise": 0.2})

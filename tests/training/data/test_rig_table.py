@@ -33,7 +33,7 @@ def table_of(legs: Dataset) -> RigTable:
 def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: int, subset: int | None) -> None:
     recipe = tiny_training(augmentation={"turn": turn, "subset": subset})
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
-    batch = told = Augmentation(recipe, table_of(legs).posed)(TRIPLES, batch, step=3, first=0)
+    batch = told = Augmentation(recipe, table_of(legs))(TRIPLES, batch, step=3, first=0)
     assert told.posed is not None
     world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])
     for said, meshes, rows, own in (
@@ -61,7 +61,7 @@ def test_surfaces_are_of_the_vertices_that_a_step_takes(legs: Dataset) -> None:
     recipe = tiny_training(augmentation={"subset": 24, "source_holes": 0.3})
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     whole = table_of(legs).posed(TRIPLES, batch).surfaces
-    told = Augmentation(recipe, table_of(legs).posed)(TRIPLES, batch, step=1, first=0)
+    told = Augmentation(recipe, table_of(legs))(TRIPLES, batch, step=1, first=0)
     assert whole is not None and told.surfaces is not None
     for surface, every, rows in zip(told.surfaces, whole, (told.source_rows, told.target_rows), strict=True):
         assert rows is not None and torch.equal(surface.cells, every.cells.gather(1, rows))

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 from datagen.mesh.rig import part_transforms
 from tests.support.three_networks import lively, meshes
 from training.networks import build_network
-from training.networks.layers.rigid_parts import ancestors, matrices, moved_joints, rotations_from_six
+from training.networks.layers.rigid_parts import (
+    ancestors,
+    matrices,
+    moved_joints,
+    nearest_rotations,
+    rotations_from_six,
+    turned_about,
+)
 from training.networks.layers.sampling import Sample, nearness, offsets, sample
 from training.networks.parts import Parts, Reading, boxed
 
@@ -88,6 +95,18 @@ def test_a_vertex_that_is_no_number_spoils_its_pair_even_where_the_sample_leaves
     assert output[0].isnan().all() and output[1].isfinite().all()
 
 
+def test_rotations_about_vectors_and_those_found_from_points_are_scipys() -> None:
+    random = np.random.default_rng(0)
+    vectors, points = random.normal(size=(6, 3)), random.normal(size=(6, 20, 3))
+    expected = Rotation.from_rotvec(vectors).as_matrix()
+    torch.testing.assert_close(turned_about(torch.from_numpy(vectors)), torch.from_numpy(expected))
+    flat = points * (1, 1, 0)  # of points in a plane a reflection would do as well
+    for some in (points, flat):
+        moved = some @ expected.swapaxes(1, 2)
+        spread = torch.from_numpy(np.einsum("bni,bnj->bij", moved, some))
+        torch.testing.assert_close(nearest_rotations(spread), torch.from_numpy(expected))
+
+
 @pytest.mark.parametrize("joints", [{"knee": "hip", "hip": None}, {}])
 def test_joints_that_are_no_tree_are_refused(joints: dict[str, str | None]) -> None:
     with pytest.raises(ValueError, match=r"joints must name a tree|'hip' is not in"):
@@ -97,8 +116,9 @@ def test_joints_that_are_no_tree_are_refused(joints: dict[str, str | None]) -> N
 def test_misfit_is_of_each_mesh_alone_and_does_not_see_the_vertices_order() -> None:
     network, vertices = lively("parts").eval(), meshes(60, seed=4)
     assert isinstance(network, Parts)
-    found, facing = network.understood(vertices)
-    assert found.shape == facing.shape == (2,) and (found >= 0).all()
+    found, roots = network.understood(vertices)
+    assert found.shape == (2,) and roots.shape == (2, 3, 3) and (found >= 0).all()
+    torch.testing.assert_close(roots @ roots.mT, torch.eye(3).expand(2, 3, 3), rtol=0, atol=1e-5)
     torch.testing.assert_close(network.understood(vertices[1:])[0], found[1:])
     torch.testing.assert_close(network.understood(vertices[:, torch.randperm(60)])[0], found, rtol=1e-4, atol=1e-6)
 

@@ -27,7 +27,7 @@ ORIGIN = {"name": "npt", "variant": "origin"}
         ),
         (
             {"augmentation": {"proportions": 0.2}},
-            "needs the parts that network 'parts' is told of, but the network is 'dsffnet': set augmentation",
+            "needs the rigs that network 'parts' is told of, but the network is 'dsffnet': set augmentation",
         ),
         ({"network": {"name": "parts", "norm_weights": "area"}}, "Extra inputs are not permitted"),
         ({"network": {"norm_weights": "mass"}}, "Input should be 'uniform' or 'area'"),

@@ -34,6 +34,20 @@ def about_vertical(cosine: Tensor, sine: Tensor) -> Tensor:
     return matrices(torch.stack([cosine, zero, sine, zero, zero + 1, zero, -sine, zero, cosine], dim=-1))
 
 
+def turned_about(vectors: Tensor) -> Tensor:
+    """Return rotations [b, 3, 3] about vectors [b, 3], by their lengths in radians."""
+    x, y, z = vectors.unbind(1)
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(matrices(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1)))
+
+
+def nearest_rotations(spread: Tensor) -> Tensor:
+    """Return the rotations [b, 3, 3] by which points p come nearest to points q; sum q p^T [b, 3, 3] (Kabsch 1976)."""
+    left, _, right = torch.linalg.svd(spread)
+    flip = torch.linalg.det(left @ right).sign()
+    return (left * torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], dim=1)[:, None]) @ right
+
+
 def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, joints: Tensor, moved: Tensor) -> Tensor:
     """Return vertices [b, n, 3] by linear blend skinning, weights [b, n, part].
 

@@ -148,7 +148,12 @@ def offsets(vertices: Tensor, near: Tensor, drawn: Sample) -> Tensor:
     """
     weighted = drawn.masses[..., None] * torch.cat([drawn.vertices, torch.ones_like(drawn.vertices[..., :1])], dim=2)
     sums = near @ weighted
-    return (vertices - sums[..., :3] / sums[..., 3:].clamp_min(1e-12)) * (2 / _RADIUS)
+    return offset(vertices, sums[..., :3] / sums[..., 3:].clamp_min(1e-12))
+
+
+def offset(vertices: Tensor, middles: Tensor) -> Tensor:
+    """Return :func:`offsets` where the middle [b, n, 3] of what is near is known."""
+    return (vertices - middles) * (2 / _RADIUS)
 
 
 def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:
@@ -157,6 +162,7 @@ def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:
     unit = torch.ones_like(one[..., :1]), torch.ones_like(other[..., :1])
     halves = -0.5 * one.square().sum(2, keepdim=True), -0.5 * other.square().sum(2, keepdim=True)
     left, right = torch.cat([one, halves[0], unit[0]], dim=2), torch.cat([other, unit[1], halves[1]], dim=2).mT
-    exponents = left @ right if apart is None else torch.baddbmm(apart.to(left.dtype), left, right)
-    # -|one - other|^2 / 2 by one product, as passes over [n, k] are what this costs; below that numbers are slow ones
-    return torch.exp(exponents.clamp_min(-60))
+    exponents = left @ right if apart is None else apart.to(left.dtype).baddbmm_(left, right)
+    # -|one - other|^2 / 2 by one product, in place, as passes over [n, k] are what this costs; below that numbers are
+    # slow ones
+    return exponents.clamp_min_(-60).exp_()

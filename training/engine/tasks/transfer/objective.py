@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.store import Dataset
-from training.data.augmentation import Shuffle, Supervise
+from training.data.augmentation import Shuffle
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.networks.execution import autocast, compiled
@@ -77,8 +77,8 @@ def objective_of(network: nn.Module, recipe: TrainingRecipe, device: torch.devic
     return PartsObjective(network) if isinstance(network, Parts) else TransferObjective(network, recipe, device)
 
 
-def supervision_of(recipe: TrainingRecipe, dataset: Dataset, device: torch.device) -> Supervise:
-    """Return what adds to a batch of triples what its network learns from beside vertices.
+def rigs_of(recipe: TrainingRecipe, dataset: Dataset, device: torch.device) -> RigTable | None:
+    """Return what a network learns from beside vertices; None where it learns from these alone.
 
     Raises
     ------
@@ -86,5 +86,5 @@ def supervision_of(recipe: TrainingRecipe, dataset: Dataset, device: torch.devic
         The dataset does not tell it (:class:`training.data.rig_table.RigTable`).
     """
     if not isinstance(recipe.network, PartsRecipe):
-        return lambda triples, batch: batch
-    return RigTable(dataset, dataset.identities("training"), recipe.network.joints, device=device).posed
+        return None
+    return RigTable(dataset, dataset.identities("training"), recipe.network.joints, device=device)

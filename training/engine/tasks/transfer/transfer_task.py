@@ -8,13 +8,14 @@ import torch
 from torch import nn
 
 from datagen.store import Dataset
-from training.data.augmentation import Augmentation, Supervise
+from training.data.augmentation import Augmentation
 from training.data.cache_policy import Room
+from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import Ranks, agreed
 from training.engine.tasks.protocol import Shares
-from training.engine.tasks.transfer.objective import objective_of, supervision_of
+from training.engine.tasks.transfer.objective import objective_of, rigs_of
 from training.engine.tasks.transfer.step_memory import require_step_memory
 from training.engine.tasks.transfer.validation import TransferValidation, require_measurable
 from training.networks import network_from
@@ -60,8 +61,8 @@ class TransferTask:
         """The training meshes, decoded, and the rigs of the bodies where a network learns from these."""
         recipe, dataset = self._recipe, self._dataset
         with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
-            supervise = agreed(ranks, lambda: supervision_of(recipe, dataset, device), what="read the rigs")
-            yield TripleFeed(recipe, self.order, bank, supervise, ranks)
+            rigs = agreed(ranks, lambda: rigs_of(recipe, dataset, device), what="read the rigs")
+            yield TripleFeed(recipe, self.order, bank, rigs, ranks)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "TransferValidation":
         """Measures PMD on some of the dataset's evaluation triples."""
@@ -78,10 +79,10 @@ class TripleFeed:
     """This rank's share of every step's triples, in parts, and their meshes on the device."""
 
     def __init__(
-        self, recipe: TrainingRecipe, order: TripleOrder, bank: VertexBank, supervise: Supervise, ranks: Ranks
+        self, recipe: TrainingRecipe, order: TripleOrder, bank: VertexBank, rigs: RigTable | None, ranks: Ranks
     ) -> None:
         self._order, self._bank, self.where = order, bank, bank.where
-        self._augment = Augmentation(recipe, supervise)
+        self._augment = Augmentation(recipe, rigs)
         self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}
 
     def batches(self, first_step: int) -> Shares:

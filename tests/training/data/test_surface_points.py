@@ -1,0 +1,106 @@
+"""Points in the place of vertices lie on the surface, even by area, and are told what the rig says there."""
+
+import numpy as np
+import pytest
+import torch
+
+from datagen.store import Dataset, open_dataset
+from tests.support.recipes import LEG, PARTS, tiny_training
+from training.data.augmentation import Augmentation
+from training.data.batch import Batch
+from training.data.rig_table import RigTable
+from training.data.surface_points import Triangles, points_of
+from training.data.vertex_bank import open_bank
+
+TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5]])
+CPU = torch.device("cpu")
+CORNERS = np.array([[0.0, 0, 0], [3, 0, 0], [0, 2, 0], [-1, 0, 0]])  # areas 3 and 1
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def random(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture
+def legs(dataset: str) -> Dataset:
+    return open_dataset(dataset)
+
+
+def augmented(legs: Dataset, **changes: float) -> Batch:
+    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
+    recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 24, **changes}})
+    return Augmentation(recipe, rigs)(TRIPLES, batch, step=2, first=0)
+
+
+def test_points_are_even_by_area() -> None:
+    corners, shares = Triangles(CORNERS, FACES, device=CPU).drawn(20_000, random(0))
+    assert (shares >= 0).all() and torch.allclose(shares.sum(dim=1), torch.ones(20_000))
+    assert (shares.diff(dim=1) <= 0).all(), "the largest share first"
+    at = (torch.from_numpy(CORNERS).float()[corners] * shares[..., None]).sum(dim=1).numpy()
+    right = at[:, 0] > 0
+    assert right.mean() == pytest.approx(0.75, abs=0.02)
+    np.testing.assert_allclose(at[right].mean(axis=0), [1, 2 / 3, 0], atol=0.03)  # the centroid of its triangle
+    np.testing.assert_allclose(at[~right].mean(axis=0), [-1 / 3, 2 / 3, 0], atol=0.03)
+
+
+def test_values_are_mixed_by_shares_and_padding_stays() -> None:
+    triangles = Triangles(CORNERS, FACES, device=CPU)
+    points = points_of([triangles, triangles], (4, 3), 6, 1.0, [random(1), random(2)])
+    vertices = torch.randn((2, 6, 3), generator=random(3))
+    for found in (
+        points.of(vertices),
+        torch.cat([points.at(mesh, torch.arange(6)).of(vertices[mesh]) for mesh in (0, 1)]),
+    ):
+        for mesh, count in enumerate((4, 3)):
+            mixed = torch.stack([vertices[mesh, own] for own in points.corners[mesh].T], dim=1)
+            expected = (mixed * points.shares[mesh, :, :, None]).sum(dim=1)
+            torch.testing.assert_close(found[mesh], expected)
+            assert torch.equal(found[mesh, count:], vertices[mesh, count:])
+            assert not torch.isclose(found[mesh, :count], vertices[mesh, :count]).all(dim=1).any()
+    untouched = points_of([triangles, triangles], (4, 3), 6, 0.0, [random(1), random(2)])
+    assert torch.equal(untouched.of(vertices), vertices)
+
+
+def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
+    batch, plain = augmented(legs, points=1.0), augmented(legs, points=0.0)
+    assert batch.points and batch.posed and plain.posed and batch.surfaces and plain.surfaces
+    for row, (source_identity, source_pose, target_identity, target_pose) in enumerate(TRIPLES.tolist()):
+        for side, (meshes, rows, identity, pose) in enumerate(
+            (
+                (batch.source, batch.source_rows, source_identity, source_pose),
+                (batch.target, batch.target_rows, target_identity, target_pose),
+                (batch.truth, batch.target_rows, target_identity, source_pose),
+            )
+        ):
+            assert rows is not None
+            whole, points = torch.from_numpy(legs.vertices(identity, pose)), batch.points[min(side, 1)]
+            low, high = whole.aminmax(dim=0)
+            boxed = (whole - (low + high) / 2) / ((high - low).max() / 2)
+            expected = points.at(row, rows[row]).of(boxed)[0]
+            torch.testing.assert_close(meshes[row], expected, rtol=0, atol=1e-3)
+            if side < 2:
+                rig = legs.rig(identity)
+                assert rig is not None
+                weights = points.at(row, rows[row]).of(torch.from_numpy(rig.weights).float())[0]
+                torch.testing.assert_close(batch.posed[side].weights[row], weights, rtol=0, atol=1e-5)
+    for with_points, without in zip(batch.posed, plain.posed, strict=True):  # the same bodies in the same poses
+        torch.testing.assert_close(with_points.rotations, without.rotations, rtol=0, atol=5e-4)
+        torch.testing.assert_close(with_points.joints, without.joints, rtol=0, atol=5e-4)
+
+
+def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
+    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
+    drawn = [rigs.of_points(TRIPLES, batch, 0.3, [random(9 * step + row) for row in range(3)]) for step in range(60)]
+    shares = [
+        (each.points[side].shares[..., 0] < 1).any(dim=1).float() for each in drawn if each.points for side in (0, 1)
+    ]
+    assert torch.cat(shares).mean() == pytest.approx(0.3, abs=0.08)
+    assert any((one != other).any() for one, other in zip(shares[::2], shares[1::2], strict=True)), "each mesh its own"
+
+
+def test_points_are_for_the_network_that_learns_from_rigs() -> None:
+    with pytest.raises(ValueError, match=r"augmentation\.points needs .* set augmentation\.points to 0"):
+        tiny_training(augmentation={"points": 0.3})
