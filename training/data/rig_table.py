@@ -162,8 +162,8 @@ class RigTable:
             """Of each mesh the values [n, c] where its vertices lie, by those at all of its topology [v, c]."""
             each = zip(values, rows, strict=True)
             if points is None:
-                return torch.stack([own[kept] for own, kept in each])
-            return torch.stack([points.at(mesh, kept).of(own)[0] for mesh, (own, kept) in enumerate(each)])
+                return torch.stack([there[kept] for there, kept in each])
+            return torch.stack([points.at(mesh, kept).of(there)[0] for mesh, (there, kept) in enumerate(each)])
 
         all_weights, all_rest = [self._weights[self._kinds[row]] for row in own], [self._rest[row] for row in own]
         weights, rest = told(all_weights), told(all_rest)

@@ -56,7 +56,7 @@ class Triangles:
 
     def __init__(self, vertices: Floats, faces: NDArray[np.integer], *, device: torch.device) -> None:
         a, b, c = np.asarray(vertices, np.float64)[faces].swapaxes(0, 1)
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-30  # a mesh without area has points, too
         self._faces = torch.from_numpy(np.asarray(faces, np.int64)).to(device)
         self._below = torch.from_numpy(np.cumsum(areas / areas.sum())).float().to(device)
 
@@ -74,6 +74,8 @@ def points_of(
 ) -> SurfacePoints:
     """Draw as many points of each mesh as it has vertices, with this chance; else its vertices stay as they are.
 
+    Even by the areas of the body at rest whose triangles these are, hence nearly so on others of the same topology.
+
     Parameters
     ----------
     counts
@@ -84,7 +86,8 @@ def points_of(
     device = random[0].device
     corners = torch.arange(rows, device=device)[None, :, None].repeat(len(meshes), 1, 3)
     shares = torch.tensor([1.0, 0.0, 0.0], device=device).repeat(len(meshes), rows, 1)
+    chosen = (torch.stack([torch.rand((), generator=own, device=device) for own in random]) < chance).tolist()
     for row, (triangles, count, own) in enumerate(zip(meshes, counts, random, strict=True)):
-        if float(torch.rand((), generator=own, device=device)) < chance:
+        if chosen[row]:
             corners[row, :count], shares[row, :count] = triangles.drawn(count, own)
     return SurfacePoints(corners, shares)

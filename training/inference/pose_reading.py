@@ -31,8 +31,8 @@ class PosesRead(NamedTuple):
 def read_poses(weights: Path, meshes: Iterable[Mesh]) -> PosesRead:
     """The pose of each mesh, over the joints that the network of ``weights`` tells apart.
 
-    How the first one stands is found, and which way each faces. The root's place is not read: a body posed so stays
-    where it stands.
+    How the first one stands is found, and which way each faces and leans. The root's place is not read: a body posed so
+    stays where it stands.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
     understand, axes, turn = understanding_of(network), None, np.eye(3)
     for number, each in enumerate(meshes):
         mesh = check_mesh(each, name=f"mesh {number}")
-        axes = axes or standing(understand, mesh.vertices)  # the others may turn round
+        axes = axes or standing(understand, mesh.vertices)  # the others may turn round and bend
         upright = axes.turned(mesh.vertices)
         turn = facing(understand, upright, turn)
         drawn = sampled(network, Mesh(upright @ turn, mesh.faces))

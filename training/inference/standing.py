@@ -46,7 +46,7 @@ animals that were read rightly have 8 at most, all else but for two things more 
 KNOWN = 0.003
 """Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
-_UPRIGHT = np.radians(12.0)  # so far a root may lean for a pose, where a mesh stands along its axes
+_UPRIGHT = np.radians(12.0)  # so far a root leans in poses that the network reads well
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -90,8 +90,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
     the best. Another way is taken where it is clearly better understood, one between the mesh' axes where it is clearly
-    better than all along them or the root leans in the best of those: nothing but the body says which way is up then,
-    so its root is brought to rest.
+    better than all along them: nothing but the body says which way is up then, so its root is brought to rest. A lean
+    that is understood is left, as it may be the pose (`facing`).
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 
     def faced(found: _Seen) -> _Seen:
         """The way turned about the vertical until the body faces +Z."""
-        return turned(found, lambda seen: _about_vertical(-seen.facing))
+        return turned(found, lambda found: _about_vertical(-found.facing))
 
     as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
     if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
@@ -126,8 +126,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         tilted = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
         best = min(seen([best.way, *tilted]), key=lambda way: way.misfit)
     found = faced(along_axes)
-    if along_axes.misfit > _CLEARLY * best.misfit or found.leaning > _UPRIGHT:
-        found = turned(best, lambda seen: seen.root.T)
+    if along_axes.misfit > _CLEARLY * best.misfit:
+        found = min(found, turned(best, lambda found: found.root.T), key=lambda way: way.misfit)
     return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
 
 
@@ -154,8 +154,9 @@ def misfit(understand: Understanding, vertices: Floats) -> float:
 
 @torch.no_grad()
 def rest_error(network: Parts, mesh: Mesh) -> float:
-    """Return by how many degrees a mesh that stands as the training data is misread (`Parts.rest_error`)."""
-    drawn = sampled(network, mesh)
+    """Return by how many degrees a mesh that stands with Y up is misread (`Parts.rest_error`)."""
+    upright = mesh.vertices @ facing(understanding_of(network), mesh.vertices, np.eye(3))
+    drawn = sampled(network, Mesh(upright, mesh.faces))
     return float(network.rest_error(network.read(drawn.vertices, drawn), drawn))
 
 
@@ -176,10 +177,6 @@ class _Seen(NamedTuple):
     @property
     def facing(self) -> float:
         return _facing(self.root)
-
-    @property
-    def leaning(self) -> float:
-        return _leaning(self.root)
 
     @property
     def stands(self) -> Standing:

@@ -208,7 +208,7 @@ class PoseTransfer:
         """Placed vertices [n_target, 3] of each frame, Y up."""
         trajectory: RootTrajectory | None = None
         turn, surfaces, first = np.eye(3), dict[str, Surface](), None
-        own = target.vertices @ self._turned_round(target.vertices, np.eye(3))  # what its own pose adds does not matter
+        own = target.vertices @ self._turned_round(target.vertices, np.eye(3))  # how it leans is of its pose, and goes
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
             axes = axes or self.standing(mesh.vertices)  # that of the first frame: the others may turn round
@@ -217,8 +217,11 @@ class PoseTransfer:
                 first = mesh
                 surfaces = surfaces_of(self._network, sources=[Mesh(vertices, mesh.faces)], targets=[target])
             turn = self._turned_round(vertices, turn)
-            output = self.vertices(vertices @ turn, own, **surfaces) @ turn.T
-            trajectory = trajectory or RootTrajectory.from_first(vertices, scale_of(target, output))
+            read = vertices @ turn
+            output = self.vertices(read, own, **surfaces) @ turn.T
+            trajectory = trajectory or RootTrajectory(
+                standing_point(vertices), scale_of(target, output) / float(bounding_box(read).half)
+            )
             yield placed(target, output) + trajectory.offset(vertices)
 
 
@@ -232,15 +235,17 @@ class RootTrajectory:
 
     A frame's box holds no place, so a walk would be a walk on the spot. The output goes where the source goes, with
     steps as long as its own size asks for. The ratio is that of the first frame, lest it tremble.
+
+    Attributes
+    ----------
+    start
+        Where the first frame stands [3], in the source's units.
+    ratio
+        Units of the target for one of the source.
     """
 
     start: Floats
     ratio: float
-
-    @classmethod
-    def from_first(cls, source: Floats, output_scale: float) -> "RootTrajectory":
-        """Return a trajectory that begins where the target stands; ``source`` [n, 3] is the first frame, Y up."""
-        return cls(standing_point(source), output_scale / float(bounding_box(source).half))
 
     def offset(self, source: Floats) -> Floats:
         """Return how far [3] the output of this frame is from where the first one stands."""

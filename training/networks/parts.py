@@ -14,7 +14,7 @@ No scale is taken from the source, so that missing vertices of it do not matter 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -253,9 +253,9 @@ class Parts(nn.Module):
         for some, near in nearness(vertices, drawn):
             sums = near @ every_told
             mass = sums[..., -1:].clamp_min(1e-9)
-            heard = iter([sums[..., at : at + _TOLD] / mass for at in range(0, _ROUNDS * _TOLD, _TOLD)])
+            heard = _one_by_one([sums[..., at : at + _TOLD] / mass for at in range(0, _ROUNDS * _TOLD, _TOLD)])
             away = offset(some, sums[..., -4:-1] / mass)
-            passed.append(self._passed(some, away, lambda *_, heard=heard: next(heard), drawn, of_sample.again()))
+            passed.append(self._passed(some, away, heard, drawn, of_sample.again()))
         return torch.cat(passed, dim=1)
 
     def _passed(self, vertices: Tensor, away: Tensor, around: _Hearing, drawn: Sample, of_sample: _OfSample) -> Tensor:
@@ -336,7 +336,13 @@ class _OfSample:
 
 
 _Known = TypeVar("_Known")
-_Hearing = Callable[["Around", Tensor], Tensor]
+_Hearing = Callable[[Around, Tensor], Tensor]
+
+
+def _one_by_one(known: Sequence[Tensor]) -> _Hearing:
+    """What is known already, of each layer in its turn."""
+    left = iter(known)
+    return lambda layer, features: next(left)
 
 
 def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:

@@ -165,7 +165,7 @@ class AugmentationRecipe(Frozen):
         ge=0,
         le=1,
         description="network parts: share of the sources, and of the targets, that are made of random points of their "
-        "surfaces, even by area, in the place of vertices",
+        "surfaces, even by area of the body at rest, in the place of vertices",
     )
     shuffle: bool = Field(
         False,

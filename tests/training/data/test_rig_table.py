@@ -28,10 +28,12 @@ def table_of(legs: Dataset) -> RigTable:
     return RigTable(legs, legs.identities("training"), LEG, device="cpu")
 
 
-@pytest.mark.parametrize("turn", [0, 25])
+@pytest.mark.parametrize(("turn", "lean"), [(0, 0), (25, 0), (25, 40)])
 @pytest.mark.parametrize("subset", [None, 24])
-def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: int, subset: int | None) -> None:
-    recipe = tiny_training(augmentation={"turn": turn, "subset": subset})
+def test_rotations_joints_and_weights_are_those_of_the_rig(
+    legs: Dataset, turn: int, lean: int, subset: int | None
+) -> None:
+    recipe = tiny_training(augmentation={"turn": turn, "lean": lean, "subset": subset})
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     batch = told = Augmentation(recipe, table_of(legs))(TRIPLES, batch, step=3, first=0)
     assert told.posed is not None
@@ -50,6 +52,7 @@ def test_rotations_joints_and_weights_are_those_of_the_rig(legs: Dataset, turn: 
             found = said.rotations[place].double().numpy() @ np.linalg.inv(rig.rotations(world[pose]))
             np.testing.assert_allclose(found[0], found[1], atol=2e-4)  # one turn for all parts
             assert (abs(np.degrees(np.arctan2(found[0, 0, 2], found[0, 0, 0]))) > 0.5) == bool(turn)
+            assert (np.degrees(np.arccos(np.clip(found[0, 1, 1], -1, 1))) > 0.3) == bool(lean)
             turned = (vertices @ found[0].T).astype(np.float64)
             box = bounding_box(turned)
             np.testing.assert_allclose(meshes[place], box.normalise(turned)[kept], atol=1e-3)

@@ -1,16 +1,20 @@
 """Points in the place of vertices lie on the surface, even by area, and are told what the rig says there."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from datagen.generate import generate
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import LEG, PARTS, tiny_training
+from tests.support.recipes import LEG, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.data.surface_points import Triangles, points_of
 from training.data.vertex_bank import open_bank
+from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
 
 TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5]])
 CPU = torch.device("cpu")
@@ -25,6 +29,15 @@ def random(seed: int) -> torch.Generator:
 @pytest.fixture
 def legs(dataset: str) -> Dataset:
     return open_dataset(dataset)
+
+
+def surface_of_topology(legs: Dataset, identity: int) -> torch.Tensor:
+    """The cell of each vertex."""
+    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    triples = np.array([[identity, 0, identity, 0]])
+    batch = rigs.posed(triples, open_bank(legs, legs.identities("training")).batch(triples))
+    assert batch.surfaces is not None
+    return batch.surfaces[0].cells[0]
 
 
 def augmented(legs: Dataset, **changes: float) -> Batch:
@@ -83,6 +96,8 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
             if side < 2:
                 rig = legs.rig(identity)
                 assert rig is not None
+                cells = surface_of_topology(legs, identity)[points.corners[row, rows[row], 0]]
+                assert torch.equal(batch.surfaces[side].cells[row], cells), "that of the nearest corner"
                 weights = points.at(row, rows[row]).of(torch.from_numpy(rig.weights).float())[0]
                 torch.testing.assert_close(batch.posed[side].weights[row], weights, rtol=0, atol=1e-5)
     for with_points, without in zip(batch.posed, plain.posed, strict=True):  # the same bodies in the same poses
@@ -99,6 +114,31 @@ def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
     ]
     assert torch.cat(shares).mean() == pytest.approx(0.3, abs=0.08)
     assert any((one != other).any() for one, other in zip(shares[::2], shares[1::2], strict=True)), "each mesh its own"
+
+
+def test_points_of_meshes_of_several_vertex_counts_are_turned_cut_and_thinned_like_vertices(
+    tmp_path: Path,
+) -> None:
+    mixed = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
+    bank, identities = open_bank(mixed, mixed.identities("training")), mixed.identities("training")
+    changes = {"subset": 24, "points": 1.0, "turn": 25, "lean": 40, "source_holes": 0.8}
+    recipe = tiny_training(**{**PARTS, "augmentation": changes})
+    augment = Augmentation(recipe, RigTable(mixed, identities, LEG, device="cpu"))
+    triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [4, 2, 0, 1]])
+    plain = bank.batch(triples)
+    assert plain.source_counts and plain.target_counts
+    whole = augment(triples, plain, step=5, first=0)
+    halves = [
+        augment(triples[at], bank.batch(triples[at]), step=5, first=at.start) for at in (slice(0, 2), slice(2, 4))
+    ]
+    torch.testing.assert_close(torch.cat([each.source for each in halves]), whole.source, rtol=0, atol=1e-6)
+    assert whole.posed
+    for posed, meshes in zip(whole.posed, (whole.source, whole.target), strict=True):
+        joints = moved_joints(posed.rest_joints, posed.rotations, torch.tensor([0, 0]), ancestors([-1, 0]))
+        bodies = skinned(posed.rest, posed.weights, posed.rotations, posed.rest_joints, joints)
+        centred = [each - each.mean(dim=1, keepdim=True) for each in (bodies, meshes)]  # by mixed weights
+        sizes = [each.square().sum((1, 2), keepdim=True).sqrt() for each in centred]
+        torch.testing.assert_close(centred[0] * (sizes[1] / sizes[0]), centred[1], rtol=0, atol=0.05)
 
 
 def test_points_are_for_the_network_that_learns_from_rigs() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from datagen.common.errors import MeshError
@@ -71,6 +72,35 @@ def test_the_way_through_space_is_kept_at_the_size_of_the_target() -> None:
     posed = PoseTransfer(Copier()).sequence([Mesh(body.vertices + step, body.faces) for step in steps], target)
     for step, frame in zip(steps, posed, strict=True):
         assert np.allclose(frame.vertices, target.vertices + 3 * step, atol=1e-5)
+
+
+def test_a_source_that_leans_is_read_upright_and_leans_in_the_output_and_a_target_that_leans_does_not_matter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    body = mesh_of(3)
+    body.vertices[:] -= body.vertices.mean(axis=0)
+    lean = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    leaning = Mesh(body.vertices @ lean.T + 5, body.faces)
+    seen = list[np.ndarray]()
+
+    class Reader(nn.Module):
+        def forward(self, *, source: Tensor, target: Tensor) -> Tensor:
+            seen.extend([source[0].numpy(), target[0].numpy()])
+            return source
+
+    def turned(self: PoseTransfer, vertices: np.ndarray, before: np.ndarray) -> np.ndarray:
+        return lean if np.allclose(vertices - vertices.mean(axis=0), body.vertices @ lean.T) else np.eye(3)
+
+    monkeypatch.setattr(PoseTransfer, "_turned_round", turned)
+    steps = np.array([[0, 0, 0], [0.5, 0, 0], [1, 0.7, 0.2]])
+    transfer = PoseTransfer(Reader())
+    frames = list(transfer.sequence([Mesh(leaning.vertices + step, body.faces) for step in steps], leaning))
+    upright = bounding_box(body.vertices).normalise(body.vertices)
+    for source, target in zip(seen[::2], seen[1::2], strict=True):
+        np.testing.assert_allclose(source, upright, atol=1e-5)
+        np.testing.assert_allclose(target, upright, atol=1e-5)
+    for step, frame in zip(steps, frames, strict=True):  # the source's own body: it leans as it did, as far away
+        np.testing.assert_allclose(frame.vertices, leaning.vertices + step, atol=1e-4)
 
 
 def test_meshes_that_stand_otherwise_come_back_in_their_own_axes(transfer: PoseTransfer) -> None:

@@ -42,10 +42,14 @@ def turned_about(vectors: Tensor) -> Tensor:
 
 
 def nearest_rotations(spread: Tensor) -> Tensor:
-    """Return the rotations [b, 3, 3] by which points p come nearest to points q; sum q p^T [b, 3, 3] (Kabsch 1976)."""
-    left, _, right = torch.linalg.svd(spread)
+    """Return the rotations [b, 3, 3] by which points p come nearest to points q; sum q p^T [b, 3, 3] (Kabsch 1976).
+
+    Those of points that are not numbers are none.
+    """
+    left, _, right = torch.linalg.svd(spread.nan_to_num(0, 0, 0))
     flip = torch.linalg.det(left @ right).sign()
-    return (left * torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], dim=1)[:, None]) @ right
+    left = left * torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], dim=1)[:, None]
+    return left @ right + spread.sum((1, 2), keepdim=True) * 0
 
 
 def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, joints: Tensor, moved: Tensor) -> Tensor:

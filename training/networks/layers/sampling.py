@@ -157,7 +157,9 @@ def offset(vertices: Tensor, middles: Tensor) -> Tensor:
 
 
 def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:
-    """Gaussian [b, n, k] of the distance of vertices [b, n, 3] from others [b, k, 3], less where they lie ``apart``."""
+    """Gaussian [b, n, k] of the distance of vertices [b, n, 3] from others [b, k, 3], less where they lie ``apart``,
+    which is written over.
+    """
     one, other = vertices / _RADIUS, others / _RADIUS
     unit = torch.ones_like(one[..., :1]), torch.ones_like(other[..., :1])
     halves = -0.5 * one.square().sum(2, keepdim=True), -0.5 * other.square().sum(2, keepdim=True)
