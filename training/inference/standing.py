@@ -46,7 +46,7 @@ animals that were read rightly have 8 at most, all else but for two things more 
 KNOWN = 0.003
 """Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
-_UPRIGHT = np.radians(12.0)  # so far a root leans in poses that the network reads well
+_UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -134,17 +134,20 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the turn [3, 3] of a body with Y up from upright and facing +Z: ``before`` but for a clear change.
 
-    That is about the vertical, or about any axis where the body clearly leans.
+    That is about the vertical, or about any axis where the body clearly leans and is better understood upright.
     """
     probe = _probe(vertices)
+
+    def seen(way: NDArray[np.float64]) -> _Seen:
+        misfits, roots = understand(_boxed(probe @ way)[None])
+        return _Seen(way, float(misfits[0]), roots[0])
+
+    found = seen(before)
     for _ in range(_TURNS):
-        root = understand(_boxed(probe @ before)[None])[1][0]
-        if _leaning(root) > _UPRIGHT:
-            before = before @ root
-        else:
-            angle = _facing(root)
-            return before @ _about_vertical(angle) if abs(angle) > _STRAIGHT else before
-    return before
+        if _leaning(found.root) <= _UPRIGHT or (upright := seen(found.way @ found.root)).misfit >= found.misfit:
+            break
+        found = upright
+    return found.way @ _about_vertical(found.facing) if abs(found.facing) > _STRAIGHT else found.way
 
 
 def misfit(understand: Understanding, vertices: Floats) -> float:

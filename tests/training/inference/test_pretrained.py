@@ -68,6 +68,16 @@ def test_a_source_may_be_turned_or_lie_and_the_target_answers_in_its_own_axes(hu
     assert pmd(answer[None], case.truths[2:]) < 0.0025
 
 
+def test_a_source_that_leans_gives_its_lean_and_a_target_that_leans_does_not_matter(human: PoseTransfer) -> None:
+    case, faces = people(poses=3), people(poses=3).target.faces
+    for axis in ("x", "z"):
+        lean = Rotation.from_euler(axis, 30, degrees=True)
+        posed = human(source=Mesh(lean.apply(case.sources[2]), faces), target=case.target)
+        assert pmd(posed.vertices[None], lean.apply(case.truths[2])[None]) < 0.003
+        posed = human(source=Mesh(case.sources[2], faces), target=Mesh(lean.apply(case.target.vertices), faces))
+        assert pmd(posed.vertices[None], case.truths[2:]) < 0.003
+
+
 def test_a_hand_that_lies_on_a_leg_is_not_taken_for_it(human: PoseTransfer) -> None:
     """Two people of the quickstart's dataset; untold, the leg is drawn out to the hand."""
     body = load_body(AnnyBody(topology="notoes_collapse5pc", phenotypes={"age": (0.0, 1.0)}))
