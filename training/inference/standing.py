@@ -42,7 +42,8 @@ def understanding_of(network: Parts) -> Understanding:
 
 MISREAD = 9.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
-animals that were read rightly have less, all else but for one chair more (docs/transfer.md)."""
+animals that were read rightly by weights of their kind have less; all else has more but for a chair by those of animals
+and two animals by those of people (docs/transfer.md)."""
 KNOWN = 0.003
 """Misfit up to which a mesh is well understood as it stands."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
@@ -134,7 +135,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the turn [3, 3] of a body with Y up from upright and facing +Z: ``before`` but for a clear change.
 
-    That is about the vertical, or about any axis where the body clearly leans and is better understood upright.
+    That is about the vertical (above 6 degrees), or about any axis where the body leans by more than 12 degrees, seen
+    from ``before``, and has a lesser misfit upright.
     """
     probe = _probe(vertices)
 

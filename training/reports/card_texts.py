@@ -100,7 +100,8 @@ SEES_ALL_VERTICES = """\
 
 READS_PARTS = """\
 - A transfer turns meshes upright first, by how well this network understands them. It errs by some degrees where a body
-  stands between the axes of its file; called by itself, the network knows bodies that stand upright only.
+  stands between the axes of its file; called by itself, the network knows bodies that lean no further than those of
+  its training.
 - Trained on meshes of {vertices} vertices, of which it reads an even sample: other densities matter little.
 - It poses by one skeleton, and what bends where that has no joint stays stiff."""
 
