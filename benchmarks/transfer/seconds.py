@@ -1,9 +1,8 @@
 """How long a transfer takes: ``python -m benchmarks.transfer.seconds [--run RUN] [--threads 2] [--vertices 6890]``.
 
-One pair with the model loaded is a DSFFNet of the paper's widths (random weights: the time is the same) and two spheres
-of so many vertices; the median of ten, after one for warming up. The whole command is a process of its own, from its
-start to its end, with the weights of a run (the paper's widths, written for the occasion, unless --run names one); the
-median of three.
+One pair with the model loaded is a DSFFNet of the paper's widths (random weights: the time is the same), or weights
+that are named, and two people of so many vertices; the median of ten, after one for warming up. The whole command is a
+process of its own, from its start to its end, with the same weights; the median of three.
 """
 
 from __future__ import annotations
@@ -20,28 +19,29 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull
 
+from benchmarks.transfer.strangers import person
 from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh
 from training.checkpoints.checkpoint import save_checkpoint
 from training.inference.predict import network_from
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
 from training.recipes.training import TrainingRecipe
+from workflows.pretrained import weights_named
 
 
 def main() -> None:
     """Measure and print everything."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, help="weights of the whole command (the paper's widths)")
+    parser.add_argument("--run", help="a run, or the name of weights that come along (the paper's widths)")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--vertices", type=int, default=6890)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        run = options.run or untrained_run(folder / "run")
-        source, target = sphere(options.vertices, seed=1), sphere(options.vertices, seed=2)
+        run = weights_named(options.run) if options.run else untrained_run(folder / "run")
+        source, target = simplified(options.vertices, pose=0), simplified(options.vertices, pose=1)
         print(f"torch {torch.__version__}, CPU, {options.threads} threads, {options.vertices:,} vertices, seconds")
         for what, seconds in inside(PoseTransfer.from_run(run), source, target).items():
             print(f"  {what:38}{seconds:7.3f}")
@@ -59,11 +59,13 @@ def untrained_run(folder: Path) -> Path:
     return folder
 
 
-def sphere(vertices: int, *, seed: int) -> Mesh:
-    """Random points on a sphere and the triangles between them."""
-    points = np.random.default_rng(seed).normal(size=(vertices, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return Mesh(points, ConvexHull(points).simplices.astype(np.int64))
+def simplified(vertices: int, *, pose: int) -> Mesh:
+    """A person of about so many vertices."""
+    import fast_simplification
+
+    mesh = person(0.6, pose=pose, number=pose, topology="anny")
+    points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces.astype(np.int32), target_count=2 * vertices)
+    return Mesh(points.astype(np.float64), faces.astype(np.int64))
 
 
 def inside(transfer: PoseTransfer, source: Mesh, target: Mesh) -> dict[str, float]:
