@@ -14,7 +14,7 @@ No scale is taken from the source, so that missing vertices of it do not matter 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -30,7 +30,7 @@ from training.networks.layers.rigid_parts import (
     rotations_from_six,
     skinned,
 )
-from training.networks.layers.sampling import Sample, nearness, offset, offsets, sample, taken, with_masses
+from training.networks.layers.sampling import Sample, nearness, offsets, sample, taken, with_masses
 from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
@@ -236,42 +236,29 @@ class Parts(nn.Module):
 
     def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
-        of_sample, told = _OfSample(), list[Tensor]()
-        masses = drawn.masses[..., None]
-        every = 1 / (drawn.near @ masses).clamp_min(1e-9)
-
-        def around_sample(layer: Around, features: Tensor) -> Tensor:
-            told.append(layer.told(features))
-            return every * (drawn.near @ (masses * told[-1]))
-
-        away = offsets(drawn.vertices, drawn.near, drawn)
-        features = self._passed(drawn.vertices, away, around_sample, drawn, of_sample)
+        of_sample = _OfSample()
+        features = self._passed(drawn.vertices, drawn.near, drawn, of_sample)
         if vertices is drawn.vertices:
             return features
-        every_told = masses * torch.cat([*told, drawn.vertices, torch.ones_like(masses)], dim=2)
-        passed = list[Tensor]()
-        for some, near in nearness(vertices, drawn):
-            sums = near @ every_told
-            mass = sums[..., -1:].clamp_min(1e-9)
-            heard = _one_by_one([sums[..., at : at + _TOLD] / mass for at in range(0, _ROUNDS * _TOLD, _TOLD)])
-            away = offset(some, sums[..., -4:-1] / mass)
-            passed.append(self._passed(some, away, heard, drawn, of_sample.again()))
-        return torch.cat(passed, dim=1)
+        return torch.cat(
+            [self._passed(some, near, drawn, of_sample.again()) for some, near in nearness(vertices, drawn)], dim=1
+        )
 
-    def _passed(self, vertices: Tensor, away: Tensor, around: _Hearing, drawn: Sample, of_sample: _OfSample) -> Tensor:
-        """Features [b, n, width] of vertices, ``away`` being their offsets and ``around`` what is heard around them."""
-
+    def _passed(self, vertices: Tensor, near: Tensor, drawn: Sample, of_sample: _OfSample) -> Tensor:
         def normed(outputs: Tensor, shift: Tensor | float = 0) -> Tensor:
             mean, scale = of_sample(_statistics, outputs, drawn.masses)
             return torch.relu((outputs - mean) * scale + shift)
 
+        masses = drawn.masses[..., None]
+        every = 1 / (near @ masses).clamp_min(1e-9)
+
         def mixed(features: Tensor, layer: nn.Module) -> Tensor:
             assert isinstance(layer, Around)
-            heard = around(layer, features)
-            return features + layer.change(normed(layer.mixed(torch.cat([features, heard], dim=2))))
+            around = every * (near @ (masses * of_sample(layer.told, features)))
+            return features + layer.change(normed(layer.mixed(torch.cat([features, around], dim=2))))
 
         first, second = self.mix
-        features = normed(self.lift(torch.cat([vertices, away], dim=2)))
+        features = normed(self.lift(torch.cat([vertices, offsets(vertices, near, drawn)], dim=2)))
         features = mixed(normed(self.features(features)), self.around[0])
         whole = of_sample(self._whole, features, drawn.masses)
         features = mixed(normed(first(features), whole), self.around[1])
@@ -336,13 +323,6 @@ class _OfSample:
 
 
 _Known = TypeVar("_Known")
-_Hearing = Callable[[Around, Tensor], Tensor]
-
-
-def _one_by_one(known: Sequence[Tensor]) -> _Hearing:
-    """What is known already, of each layer in its turn."""
-    left = iter(known)
-    return lambda layer, features: next(left)
 
 
 def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:

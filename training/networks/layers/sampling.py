@@ -148,12 +148,7 @@ def offsets(vertices: Tensor, near: Tensor, drawn: Sample) -> Tensor:
     """
     weighted = drawn.masses[..., None] * torch.cat([drawn.vertices, torch.ones_like(drawn.vertices[..., :1])], dim=2)
     sums = near @ weighted
-    return offset(vertices, sums[..., :3] / sums[..., 3:].clamp_min(1e-12))
-
-
-def offset(vertices: Tensor, middles: Tensor) -> Tensor:
-    """Return :func:`offsets` where the middle [b, n, 3] of what is near is known."""
-    return (vertices - middles) * (2 / _RADIUS)
+    return (vertices - sums[..., :3] / sums[..., 3:].clamp_min(1e-12)) * (2 / _RADIUS)
 
 
 def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:
