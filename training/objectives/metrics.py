@@ -31,7 +31,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
@@ -234,6 +233,8 @@ def _drawn(count: int, points: int, seed: int) -> NDArray[np.int64]:
 
 
 def _assignment(prediction: Points, truth: Points) -> float:
+    from scipy.optimize import linear_sum_assignment  # it takes a while, and a transfer asks for no EMD
+
     costs = cdist(prediction, truth)
     if not costs.any():
         return 0.0
