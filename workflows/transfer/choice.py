@@ -82,7 +82,9 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         )
     taken = target or source or "human"
     known = job.target if target else job.sources[0] if source else None
-    reason = f"the weights {taken} are taken, as {f'they know {known}' if known else 'for every such mesh'}. {POOR}"
+    instead = "; for wide clothes add --model=dressed" if taken == "human" else ""
+    why = f"they know {known}" if known else "for every such mesh"
+    reason = f"the weights {taken} are taken, as {why}. {POOR}{instead}"
     doubts = (
         "" if source else f"{job.sources[0]} is {_neither(every, 0)}; {reason}",
         "" if target else f"{job.target} is {_neither(every, 1)}; {reason}",
