@@ -105,9 +105,10 @@ def transfer_command(options: argparse.Namespace) -> None:
     ):
         print_note("loading the network ...")
         gc.disable()  # what an import makes is no garbage, and looking for some is a tenth of torch's
-        from workflows.transfer.run import TransferWork
-
-        gc.enable()
+        try:
+            from workflows.transfer.run import TransferWork
+        finally:
+            gc.enable()
         work = TransferWork.of(job, weights, first=source.mesh, target=target, force=options.force)
         print_text(printable(work.run()))
 

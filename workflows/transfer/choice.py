@@ -82,7 +82,7 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         )
     taken = target or source or "human"
     known = job.target if target else job.sources[0] if source else None
-    instead = "; for wide clothes add --model=dressed" if taken == "human" else ""
+    instead = ". If it wears wide clothes, add --model=dressed" if taken == "human" else ""
     why = f"they know {known}" if known else "for every such mesh"
     reason = f"the weights {taken} are taken, as {why}. {POOR}{instead}"
     doubts = (

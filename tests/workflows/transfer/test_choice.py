@@ -105,6 +105,7 @@ def test_what_no_weights_know_is_told_of_as_nothing_else(choose: Choose, said: l
         choose(source, target, force=True)
         for name, doubt, reason in zip(("a.obj", "b.obj"), said, reasons, strict=True):
             assert re.match(f"{name} {neither} the weights {reason}", doubt) if reason else not doubt
+            assert doubt.endswith("add --model=dressed") == reason.startswith("human")
 
 
 def test_one_of_each_is_refused_but_when_it_is_forced(choose: Choose) -> None:

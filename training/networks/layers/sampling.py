@@ -20,8 +20,8 @@ from training.networks.layers.modulation import full_precision
 from training.networks.layers.surface import Surface, of_cells
 
 _CELL = 1 / 32
-"""Edge of the grid's cells, half the longest edge of a mesh' box being 1. Small ones, that thin out what is meshed much
-more finely than the rest and little else: cells of 1/16, of which a person meets 900, cost an eighth of the accuracy."""
+"""Edge of the grid's cells, half the longest edge of a mesh' box being 1: they thin out what is meshed much more finely
+than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _MOST = 1024
 _MOST_AT_ONCE = 1024
 _RADIUS = 0.1
@@ -102,7 +102,9 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
-    Layers of a surface that touch have cells of their own.
+    Of more cells than the sample takes, those are taken whose vertex is nearest to the middle: on a body they lie more
+    evenly than a draw (docs/networks.md), but flat faces along the grid may be left out as a whole. Layers of a surface
+    that touch have cells of their own.
     """
     scaled = vertices.nan_to_num().clamp(-5, 5) / _CELL
     cell = scaled.floor()
