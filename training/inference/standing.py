@@ -45,7 +45,7 @@ MISREAD = 9.0
 animals that were read rightly by weights of their kind have less; all else has more but for a chair by those of animals
 and two animals by those of people (docs/transfer.md)."""
 KNOWN = 0.002
-"""Misfit up to which a mesh is well understood as it stands."""
+"""Misfit up to which a mesh is well understood as it stands; bare people have 0.0014 at most (docs/transfer.md)."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken

@@ -14,6 +14,7 @@ from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PoseRecipe
 from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import PoseTransfer
+from training.networks.layers.sampling import sample
 from training.objectives.metrics import point_mesh_distance
 from workflows.pretrained import weights_named
 
@@ -53,6 +54,12 @@ def test_new_people_are_brought_into_new_poses(weights: str, most: float) -> Non
     unchanged = np.broadcast_to(case.truths[:1], outputs.shape)
     error, doing_nothing = (pmd(found, case.truths[1:]) for found in (outputs, unchanged))
     assert error < most and 8 * error < doing_nothing
+
+
+def test_what_is_read_of_a_body_that_is_not_dense_is_most_of_it() -> None:
+    drawn = sample(torch.from_numpy(_boxed(people(poses=2).sources)).float())
+    assert drawn.masses.shape == (2, 615)
+    assert ((drawn.masses > 0).sum(1) > 500).all()
 
 
 def test_a_source_may_be_turned_or_lie_and_the_target_answers_in_its_own_axes(human: PoseTransfer) -> None:

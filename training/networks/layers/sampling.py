@@ -22,6 +22,8 @@ from training.networks.layers.surface import Surface, of_cells
 _CELL = 1 / 32
 """Edge of the grid's cells, half the longest edge of a mesh' box being 1: they thin out what is meshed much more finely
 than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
+_BEYOND = 5
+"""Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 _MOST = 1024
 _MOST_AT_ONCE = 1024
 _RADIUS = 0.1
@@ -106,7 +108,7 @@ def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]
     evenly than a draw (docs/networks.md), but flat faces along the grid may be left out as a whole. Layers of a surface
     that touch have cells of their own.
     """
-    scaled = vertices.nan_to_num().clamp(-5, 5) / _CELL
+    scaled = vertices.nan_to_num().clamp(-_BEYOND, _BEYOND) / _CELL
     cell = scaled.floor()
     off = (scaled - cell - 0.5).square().sum(dim=2)
     x, y, z = cell.long().unbind(2)
