@@ -24,6 +24,7 @@ from datagen.sizes import require_memory
 from datagen.store.attributes import check_same_assets
 from datagen.store.location import remove, require_ours, writing_alone
 from datagen.store.manifest import ManifestRow, SoFar
+from datagen.store.objects import is_local
 from datagen.store.reader import Dataset, open_dataset
 from datagen.store.schema import check_extent, open_group, stored_recipe
 from datagen.store.verify import Fault, find_faults
@@ -47,6 +48,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 _SAVE_SECONDS, _SAVE_SHARE = 10.0, 50
 """Between two notes of the shards so far, at least, and as many times as long as one takes."""
+_OTHERS = 3
+"""How often a dataset that was made may be found unfinished, as somebody else makes it, on a store without a lock."""
 
 
 def generate(
@@ -87,8 +90,16 @@ def generate(
     with writing_alone(url):
         if fresh:
             remove(url)
-        _make_missing(recipe, url, run, progress)
-    return open_dataset(url)
+        met = 0
+        while True:
+            _make_missing(recipe, url, run, progress)
+            try:
+                return open_dataset(url)
+            except DatasetError as error:
+                met += 1
+                if is_local(url) or met > _OTHERS:
+                    raise
+                log.warning("%s. Somebody else makes it, too; looking again for what is missing", error)
 
 
 def append(

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -20,6 +21,9 @@ from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import ensure_shards, generate, inline, make_shard, shards
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
+from datagen.store.manifest import commit
+from datagen.store.objects import read_bytes, write_bytes
+from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
 from tests.support.recipes import shards_of, tiny_dataset
@@ -63,8 +67,6 @@ def test_any_order_and_any_interruption_give_the_same_bytes(
 
 
 def test_an_existing_shard_is_not_made_again(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from datagen.store.schema import open_group
-
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
     made: list[Any] = []
     monkeypatch.setattr(shards, "make_shard", lambda recipe, shard: made.append(shard) or make_shard(recipe, shard))
@@ -78,6 +80,29 @@ def test_two_generators_on_one_dataset(tmp_path: Path) -> None:
     with writing_alone(url), pytest.raises(DatasetError, match="another process is writing to"):
         generate(tiny_dataset(), url)
     assert not Path(url).exists()
+
+
+@pytest.mark.parametrize("cut", [0, 1])
+def test_two_generators_on_a_store_without_a_lock(dataset: str, monkeypatch: pytest.MonkeyPatch, cut: int) -> None:
+    """One that has begun meanwhile writes its empty manifest over the finished one's, with or without the root."""
+    url, real, seen = f"memory://{uuid4().hex}.zarr", generation.finish, list[DatasetError]()
+
+    def finish(*given: Any) -> None:
+        real(*given)
+        if not seen:
+            group = open_group(url, mode="r+")
+            root = read_bytes(group, "zarr.json") or b""
+            commit(group, [], {"status": "building"})
+            if cut:  # the manifest is written before the root
+                write_bytes(group, "zarr.json", root)
+            with pytest.raises(DatasetError) as caught:
+                open_dataset(url)
+            seen.append(caught.value)
+
+    monkeypatch.setattr(generation, "finish", finish)
+    made = generate(tiny_dataset(), url)
+    assert ["status 'building'", "not the one that was committed"][cut] in str(seen[0])
+    assert np.array_equal(made.vertices(3), open_dataset(dataset).vertices(3)) and not list(find_faults(url))
 
 
 def test_sigkill_while_writing(dataset: str, tmp_path: Path) -> None:
