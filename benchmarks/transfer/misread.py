@@ -74,7 +74,7 @@ def reading(transfer: PoseTransfer, mesh: Mesh) -> tuple[float, float]:
     """Misfit and rest error of a mesh as it is found to stand."""
     found = transfer.standing(mesh.vertices)
     assert isinstance(found, Standing)
-    return found.misfit, transfer.rest_error(Mesh(found.turned(mesh.vertices), mesh.faces))
+    return found.misfit, transfer.rest_error(Mesh(found.upright(mesh.vertices), mesh.faces))
 
 
 def best_limit(bodies: NDArray[np.float64], others: NDArray[np.float64]) -> str:

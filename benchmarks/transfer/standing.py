@@ -70,7 +70,7 @@ def report_found(understand: Understanding, meshes: list[NDArray[np.floating]]) 
         for mesh in meshes:
             turn = draw()
             stands = standing(understand, turn.apply(mesh))
-            lean = Rotation.from_matrix(facing(understand, stands.turned(turn.apply(mesh)), np.eye(3)))
+            lean = Rotation.from_matrix(facing(understand, stands.turned(turn.apply(mesh)), stands.lean))
             found = Rotation.from_matrix(stands.matrix) * turn
             left.append(np.degrees(found.magnitude()))
             as_read.append(np.degrees((lean.inv() * found).magnitude()))

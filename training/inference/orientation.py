@@ -66,6 +66,11 @@ class Axes:
         up, front = _direction(self.up), _direction(self.front)
         return np.stack([np.cross(up, front), up, front])
 
+    @property
+    def lean(self) -> NDArray[np.float64]:
+        """How a body is turned [3, 3] from upright then: not at all, as far as axes can say."""
+        return np.eye(3)
+
     def turned(self, vertices: Floats) -> Floats:
         """Vertices [..., 3] in the file's axes -> Y up, facing +Z."""
         return vertices if self == UPRIGHT else vertices @ self.matrix.T

@@ -66,7 +66,9 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
     understand, axes, turn = understanding_of(network), None, np.eye(3)
     for number, each in enumerate(meshes):
         mesh = check_mesh(each, name=f"mesh {number}")
-        axes = axes or standing(understand, mesh.vertices)  # the others may turn round and bend
+        if axes is None:  # the others may turn round and bend
+            axes = standing(understand, mesh.vertices)
+            turn = axes.lean
         upright = axes.turned(mesh.vertices)
         turn = facing(understand, upright, turn)
         drawn = sampled(network, Mesh(upright @ turn, mesh.faces))

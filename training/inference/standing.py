@@ -7,7 +7,7 @@ turns between the axes as well, so that it is done without being asked for.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import NamedTuple
 
@@ -48,6 +48,7 @@ KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands; bare people have 0.0014 at most (docs/transfer.md)."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
+_LEANS = np.radians(50.0)  # a little more than half way to another axis, as most files have Y up
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -67,18 +68,25 @@ class Standing:
     matrix
         [3, 3].
     misfit
-        In the normalised box.
+        In the normalised box, of the body brought upright.
     rest_error
         In degrees (`Parts.rest_error`); NaN where nobody asked.
+    lean
+        How the body is turned [3, 3] from upright after that, where it has to be known before the body is understood.
     """
 
     matrix: NDArray[np.float64]
     misfit: float
     rest_error: float = np.nan
+    lean: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
 
     def turned(self, vertices: Floats) -> Floats:
         """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z."""
         return vertices @ self.matrix.T
+
+    def upright(self, vertices: Floats) -> Floats:
+        """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z, without the lean."""
+        return self.turned(vertices) @ self.lean
 
     def restored(self, vertices: Floats) -> Floats:
         """Vertices [..., 3], Y up and facing +Z -> the mesh' own axes."""
@@ -90,9 +98,10 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
-    the best. Another way is taken where it is clearly better understood, one between the mesh' axes where it is clearly
-    better than all along them: nothing but the body says which way is up then, so its root is brought to rest. A lean
-    that is understood is left, as it may be the pose (`facing`).
+    the best. Another way is taken where it is clearly better understood. A body that is upright then at most 50 degrees
+    from how it stands in its file leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
+    axes is taken where it is clearly better than all along them: nothing but the body says which way is up then, so its
+    root is brought to rest. A lean that is understood is left, too (`facing`).
 
     Parameters
     ----------
@@ -119,16 +128,19 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
         return faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
-    if best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit:
-        return faced(best).stands
+    if _CLEARLY * best.misfit < min(as_it_is.misfit, _CLEARLY * KNOWN) and (ahead := faced(best)).misfit <= KNOWN:
+        return ahead.stands  # of a body that leans the facing may be misread, and the misfit says so
     every = seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES])
     along_axes, best = (min(some, key=lambda way: way.misfit) for some in (every[: _SIDES * len(_ANGLES)], every))
     for size in _TILTS:
         tilted = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
         best = min(seen([best.way, *tilted]), key=lambda way: way.misfit)
+    upright = turned(best, lambda found: found.root.T)
+    if _leaning(upright.way.T) <= _LEANS and _CLEARLY * upright.misfit < as_it_is.misfit:
+        return upright.leans
     found = faced(along_axes)
     if along_axes.misfit > _CLEARLY * best.misfit:
-        found = min(found, turned(best, lambda found: found.root.T), key=lambda way: way.misfit)
+        found = min(found, upright, key=lambda way: way.misfit)
     return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
 
 
@@ -186,6 +198,13 @@ class _Seen(NamedTuple):
     @property
     def stands(self) -> Standing:
         return Standing(self.way, self.misfit)
+
+    @property
+    def leans(self) -> Standing:
+        """Of a way that brings a body upright: turned about the vertical alone, the rest being its lean."""
+        facing = _facing(self.way.T)
+        about = _about_vertical(-facing if abs(facing) > _STRAIGHT else 0.0)
+        return Standing(about, self.misfit, lean=about @ self.way.T)
 
 
 def _facing(root: NDArray[np.float64]) -> float:

@@ -142,7 +142,7 @@ class PoseTransfer:
         check_mesh(target, name="target")
         target_axes = target_axes or self.standing(target.vertices)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
-        frames = self._frames(sources, upright, source_axes)
+        frames = self._frames(sources, source_axes, upright, target_axes.lean)
         if smooth:
             from training.inference.smoothing import smoothed
 
@@ -204,14 +204,19 @@ class PoseTransfer:
         """The turn [3, 3] of a body from upright, facing +Z, if the network can say; ``before``: the last frame's."""
         return facing(understanding_of(self._network), vertices, before) if isinstance(self._network, Parts) else before
 
-    def _frames(self, sources: Iterable[Mesh], target: Mesh, axes: Stands) -> Iterator[Floats]:
-        """Placed vertices [n_target, 3] of each frame, Y up."""
+    def _frames(
+        self, sources: Iterable[Mesh], axes: Stands, target: Mesh, lean: NDArray[np.float64]
+    ) -> Iterator[Floats]:
+        """Placed vertices [n_target, 3] of each frame, Y up; the target leans, but for what is found here."""
         trajectory: RootTrajectory | None = None
         turn, surfaces, first = np.eye(3), dict[str, Surface](), None
-        own = target.vertices @ self._turned_round(target.vertices, np.eye(3))  # how it leans is of its pose, and goes
+        own = target.vertices @ self._turned_round(target.vertices, lean)  # how it leans is of its pose, and goes
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
-            axes = axes or self.standing(mesh.vertices)  # that of the first frame: the others may turn round
+            if number == 0:  # the others may turn round and bend
+                axes = axes or self.standing(mesh.vertices)
+                turn = axes.lean
+            assert axes is not None
             vertices = axes.turned(mesh.vertices)
             if first is None or not _is_same_mesh(mesh, first):  # else what is near stays so from pose to pose
                 first = mesh

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-KINDS = {"human": "a person", "animals": "an animal on four legs"}
-"""Those that a transfer chooses from where none are named, and what they pose."""
+KINDS = {"human": "a person", "dressed": "a person", "animals": "an animal on four legs"}
+"""Those that a transfer chooses from where none are named, and what they pose; the first of equally good ones."""
 
 
 def own_weights(name: str) -> Path:

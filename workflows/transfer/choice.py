@@ -1,4 +1,4 @@
-"""Which of the weights that come along pose two meshes: those of people, or those of animals."""
+"""Which of the weights that come along pose two meshes: those of people, of people in clothes, or of animals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ def _standing(transfer: PoseTransfer, mesh: Mesh, axes: Axes | None) -> Standing
         stands = transfer.standing(mesh.vertices)
         assert isinstance(stands, Standing)
         found = stands
-    return replace(found, rest_error=transfer.rest_error(Mesh(found.turned(mesh.vertices), mesh.faces)))
+    return replace(found, rest_error=transfer.rest_error(Mesh(found.upright(mesh.vertices), mesh.faces)))
 
 
 def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Load | None = None) -> Chosen:
@@ -74,31 +74,38 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         return people
     others = [name for name in KINDS if name != "human"]
     every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes, load) for name in others}
-    source, target = (_kind(every, place) for place in range(2))
+    errors = {name: [found.rest_error for found in each.standings] for name, each in every.items()}
+    source, target = kinds = [_kind(errors, place) for place in range(2)]
     if source and target and source != target and not force:
         raise MeshError(
-            f"{job.sources[0]} is {KINDS[source]} and {job.target} is {KINDS[target]}: a pose of the one says nothing "
+            f"{job.sources[0]} is {source} and {job.target} is {target}: a pose of the one says nothing "
             "of the other. Give two of a kind; or add --force, to see what comes of it"
         )
-    taken = target or source or "human"
-    known = job.target if target else job.sources[0] if source else None
-    instead = ". If it wears wide clothes, add --model=dressed" if taken == "human" else ""
-    why = f"they know {known}" if known else "for every such mesh"
-    reason = f"the weights {taken} are taken, as {why}. {POOR}{instead}"
+    kind = target or source or KINDS["human"]
+    known = [place for place in range(2) if kinds[place] == kind]
+    able = [name for name in every if KINDS[name] == kind]
+    taken = min(able, key=lambda name: max((errors[name][place] for place in known), default=0))
+    why = f"they know {(job.sources[0], job.target)[known[-1]]}" if known else "for every such mesh"
+    reason = f"the weights {taken} are taken, as {why}. {POOR}"
     doubts = (
-        "" if source else f"{job.sources[0]} is {_neither(every, 0)}; {reason}",
-        "" if target else f"{job.target} is {_neither(every, 1)}; {reason}",
+        "" if source else f"{job.sources[0]} is {_neither(errors, 0)}; {reason}",
+        "" if target else f"{job.target} is {_neither(errors, 1)}; {reason}",
     )
     return replace(every[taken], doubts=doubts)
 
 
-def _kind(every: dict[str, Chosen], place: int) -> str | None:
-    """The weights by which a mesh is read best, if any reads it."""
-    errors = {name: each.standings[place].rest_error for name, each in every.items()}
-    return min((name for name in every if errors[name] <= MISREAD), key=errors.__getitem__, default=None)
+Errors = dict[str, list[float]]
+"""By how many degrees each weights misread the source and the target."""
 
 
-def _neither(every: dict[str, Chosen], place: int) -> str:
-    errors = " and ".join(f"{each.standings[place].rest_error:.0f} ({name})" for name, each in every.items())
-    known = " nor ".join(KINDS.values())
-    return f"neither {known} as the weights know them: misread by {errors} degrees, more than {MISREAD:g}"
+def _kind(errors: Errors, place: int) -> str | None:
+    """What a mesh is by the weights that read it best, if any reads it."""
+    best = min(errors, key=lambda name: errors[name][place])
+    return KINDS[best] if errors[best][place] <= MISREAD else None
+
+
+def _neither(errors: Errors, place: int) -> str:
+    each = [f"{found[place]:.0f} ({name})" for name, found in errors.items()]
+    known = " nor ".join(dict.fromkeys(KINDS.values()))
+    misread = f"{', '.join(each[:-1])} and {each[-1]}"
+    return f"neither {known} as the weights know them: misread by {misread} degrees, more than {MISREAD:g}"

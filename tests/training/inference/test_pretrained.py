@@ -78,8 +78,8 @@ def test_a_source_may_be_turned_or_lie_and_the_target_answers_in_its_own_axes(hu
 def test_a_source_that_leans_gives_its_lean_and_a_target_that_leans_does_not_matter(human: PoseTransfer) -> None:
     case = people(poses=3)
     faces = case.target.faces
-    for axis in ("x", "z"):
-        lean = Rotation.from_euler(axis, 30, degrees=True)
+    for axis, degrees in (("x", 30), ("z", 30), ("x", 45), ("z", -45)):
+        lean = Rotation.from_euler(axis, degrees, degrees=True)
         posed = human(source=Mesh(lean.apply(case.sources[2]), faces), target=case.target)
         assert pmd(posed.vertices[None], lean.apply(case.truths[2])[None]) < 0.0006
         posed = human(source=Mesh(case.sources[2], faces), target=Mesh(lean.apply(case.target.vertices), faces))

@@ -40,9 +40,9 @@ def understand_leaning(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64
 
 
 def left_over(turn: Rotation) -> float:
-    """Degrees that a body turned so is from upright after it was turned as was found."""
+    """Degrees that a body turned so is from upright after it was turned as was found, its lean included."""
     found = standing(understand, turn.apply(BODY) * 40 + 7)
-    return float(np.degrees((Rotation.from_matrix(found.matrix) * turn).magnitude()))
+    return float(np.degrees((Rotation.from_matrix(found.lean.T @ found.matrix) * turn).magnitude()))
 
 
 def test_an_upright_body_is_left_exactly_as_it_is() -> None:
@@ -60,6 +60,19 @@ def test_a_turn_about_the_vertical_is_undone_and_no_lean_with_it(angle: float) -
 @pytest.mark.parametrize("number", range(8))
 def test_a_body_that_lies_anyhow_is_set_upright(number: int) -> None:
     assert left_over(Rotation.random(random_state=number)) < 0.1
+
+
+@pytest.mark.parametrize(("axis", "degrees", "leans"), [("x", 30, True), ("z", -45, True), ("x", 58, False)])
+def test_a_lean_from_the_way_up_of_the_file_is_told_from_another_way_up(axis: str, degrees: int, leans: bool) -> None:
+    """A body is turned about the vertical to face +Z, and its lean is kept; beyond 50 degrees it counts as lying."""
+    turn = Rotation.from_euler("y", 70, degrees=True) * Rotation.from_euler(axis, degrees, degrees=True)
+    found = standing(understand, turn.apply(BODY))
+    assert left_over(turn) < 0.1
+    leaning = np.degrees(np.arccos(found.lean[1, 1]))
+    assert leaning == pytest.approx(abs(degrees) if leans else 0, abs=0.1)
+    if leans:
+        assert found.matrix[1] == pytest.approx([0, 1, 0]), "what is up in the file stays so"
+        assert found.upright(turn.apply(BODY)) == pytest.approx(BODY, abs=0.01)
 
 
 def test_what_is_understood_in_no_way_is_left_alone() -> None:
