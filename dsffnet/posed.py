@@ -125,7 +125,7 @@ def _of_python(message: str) -> str:
     """A message in which options are arguments: ``--up=Z`` is ``up='Z'``, ``add --force`` is ``add force=True``."""
     for words, ours in _OF_PYTHON.items():
         message = message.replace(words, ours)
-    stated = re.compile(r"--(up|front|model)=([^\s:]+)( (?=--))?")
+    stated = re.compile(r"--(up|front)=([^\s:]+)( (?=--))?")
     message = stated.sub(lambda m: f"{m[1]}='{m[2]}'{', ' if m[3] else ''}", message)
     return re.sub(r"(?<!\S)--([a-z]+)", r"\1", re.sub(r"\badd --([a-z]+)", r"add \1=True", message))
 

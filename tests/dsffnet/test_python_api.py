@@ -117,7 +117,6 @@ def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch,
     advice = "add --align, or --up=Z,Y --front=-Y,Z: or add --force; look at --picture"
     assert _of_python(advice) == "add align=True, or up='Z,Y', front='-Y,Z': or add force=True; look at it"
     assert _of_python("State --up=Z") == "State up='Z'"
-    assert _of_python("wide clothes, add --model=dressed") == "wide clothes, add model='dressed'"
 
 
 def test_a_scene_is_posed_as_one_body(run: Path) -> None:

@@ -42,13 +42,13 @@ def understanding_of(network: Parts) -> Understanding:
 
 MISREAD = 9.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
-animals that were read rightly by weights of their kind have less; all else has more but for a chair by those of animals
-and two animals by those of people (docs/transfer.md)."""
+animals that were read rightly by weights of their kind have less; all else has more but for a table or an animal by
+weights of people, and a person in a dress by those of animals (docs/transfer.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands; bare people have 0.0014 at most (docs/transfer.md)."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
-_LEANS = np.radians(50.0)  # a little more than half way to another axis, as most files have Y up
+_LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -68,7 +68,7 @@ class Standing:
     matrix
         [3, 3].
     misfit
-        In the normalised box, of the body brought upright.
+        In the normalised box, without the lean.
     rest_error
         In degrees (`Parts.rest_error`); NaN where nobody asked.
     lean
@@ -98,8 +98,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
     angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
-    the best. Another way is taken where it is clearly better understood. A body that is upright then at most 50 degrees
-    from how it stands in its file leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
+    the best. Another way is taken where it is clearly better understood. A body whose way upward is at most 50 degrees
+    from the file's Y then leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
     axes is taken where it is clearly better than all along them: nothing but the body says which way is up then, so its
     root is brought to rest. A lean that is understood is left, too (`facing`).
 
@@ -121,24 +121,26 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return found
 
     def faced(found: _Seen) -> _Seen:
-        """The way turned about the vertical until the body faces +Z."""
-        return turned(found, lambda found: _about_vertical(-found.facing))
+        """The way turned about the vertical until the body faces +Z; left where that is misread, as where it leans."""
+        ahead = turned(found, lambda found: _about_vertical(-found.facing))
+        return ahead if ahead.misfit <= max(KNOWN, found.misfit) else found
 
     as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
     if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
         return faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
-    if _CLEARLY * best.misfit < min(as_it_is.misfit, _CLEARLY * KNOWN) and (ahead := faced(best)).misfit <= KNOWN:
-        return ahead.stands  # of a body that leans the facing may be misread, and the misfit says so
+    understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
+    if understood and (ahead := faced(best)) is not best:
+        return ahead.stands
     every = seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES])
     along_axes, best = (min(some, key=lambda way: way.misfit) for some in (every[: _SIDES * len(_ANGLES)], every))
     for size in _TILTS:
         tilted = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
         best = min(seen([best.way, *tilted]), key=lambda way: way.misfit)
-    upright = turned(best, lambda found: found.root.T)
-    if _leaning(upright.way.T) <= _LEANS and _CLEARLY * upright.misfit < as_it_is.misfit:
+    found, upright = faced(along_axes), turned(best, lambda found: found.root.T)
+    likely = _CLEARLY * upright.misfit < as_it_is.misfit and upright.misfit <= _CLEARLY * found.misfit
+    if likely and _leaning(upright.way.T) <= _LEANS:
         return upright.leans
-    found = faced(along_axes)
     if along_axes.misfit > _CLEARLY * best.misfit:
         found = min(found, upright, key=lambda way: way.misfit)
     return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)

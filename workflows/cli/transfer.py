@@ -48,8 +48,8 @@ def add_model_option(made: Parser) -> None:
     made.add_argument(
         "--model",
         metavar="RUN",
-        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, animals, dressed (people "
-        "in clothes), anny-quickstart (default: human or animals, by the meshes)",
+        help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, dressed (people in "
+        "wide clothes), animals, anny-quickstart (default: one of the first three, by the meshes)",
     )
 
 

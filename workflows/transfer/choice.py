@@ -58,9 +58,9 @@ def _standing(transfer: PoseTransfer, mesh: Mesh, axes: Axes | None) -> Standing
 
 
 def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Load | None = None) -> Chosen:
-    """Return the weights that know both meshes best; of meshes that none knows, those of people.
+    """Return the weights that know both meshes best; of meshes that none knows, `human`.
 
-    The others are not asked where people's know both well: among all the ways to turn an animal there may be one in
+    The others are not asked where `human` knows both well: among all the ways to turn an animal there may be one in
     which it passes for a person, but worse by far than people do.
 
     Raises
@@ -100,8 +100,8 @@ Errors = dict[str, list[float]]
 
 def _kind(errors: Errors, place: int) -> str | None:
     """What a mesh is by the weights that read it best, if any reads it."""
-    best = min(errors, key=lambda name: errors[name][place])
-    return KINDS[best] if errors[best][place] <= MISREAD else None
+    able = [name for name, found in errors.items() if found[place] <= MISREAD]
+    return KINDS[min(able, key=lambda name: errors[name][place])] if able else None
 
 
 def _neither(errors: Errors, place: int) -> str:
