@@ -64,7 +64,7 @@ def main() -> None:
         found = [transfer.standing(each.mesh.vertices) for each in (source, target)]
         posed = transfer(source=source.mesh, target=target.mesh, source_axes=found[0], target_axes=found[1])
         errors = [
-            transfer.rest_error(Mesh(way.turned(each.mesh.vertices) @ way.lean, each.mesh.faces))
+            transfer.rest_error(Mesh(way.upright(each.mesh.vertices), each.mesh.faces))
             for way, each in zip(found, (source, target), strict=True)
         ]
         words = ", ".join(f"{error:.1f}{'' if error <= MISREAD else '!'}" for error in errors)

@@ -120,7 +120,7 @@ def remarks(
     doubt
         Why the mesh may be no body that a network which finds how it stands knows; by default its rest error says so.
     """
-    upright = axes.turned(mesh.vertices) @ axes.lean
+    upright = axes.upright(mesh.vertices)
     if isinstance(axes, Standing):
         fits, line = not doubt and axes.rest_error <= MISREAD, doubt or _about_a_stranger(name, axes)
     elif way is None:

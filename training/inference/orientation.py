@@ -75,6 +75,10 @@ class Axes:
         """Vertices [..., 3] in the file's axes -> Y up, facing +Z."""
         return vertices if self == UPRIGHT else vertices @ self.matrix.T
 
+    def upright(self, vertices: Floats) -> Floats:
+        """As `turned`: axes say nothing of a lean."""
+        return self.turned(vertices)
+
     def restored(self, vertices: Floats) -> Floats:
         """Vertices [..., 3], Y up and facing +Z -> the file's axes."""
         return vertices if self == UPRIGHT else vertices @ self.matrix
