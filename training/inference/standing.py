@@ -52,6 +52,7 @@ _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more th
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
+_FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways, of which so many are read as well as the others
 _SIDES = 6  # of a box: directions along the axes
 _QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
 _TURNS = 3
@@ -108,36 +109,21 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     mesh
         Vertices [n, 3] in any unit; 256 of them are read.
     """
-    probe = _probe(mesh)
-
-    def seen(ways: Sequence[NDArray[np.float64]]) -> list[_Seen]:
-        misfits, roots = understand(np.stack([_boxed(probe @ way.T) for way in ways]))
-        return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
-
-    def turned(found: _Seen, undone: Callable[[_Seen], NDArray[np.float64]]) -> _Seen:
-        """The way turned by what undoes the root's turn, as far as the network can say."""
-        for _ in range(_TURNS):
-            found = seen([undone(found) @ found.way])[0]
-        return found
-
-    def faced(found: _Seen) -> _Seen:
-        """The way turned about the vertical until the body faces +Z; left where that is misread, as where it leans."""
-        ahead = turned(found, lambda found: _about_vertical(-found.facing))
-        return ahead if ahead.misfit <= max(KNOWN, found.misfit) else found
-
-    as_it_is, *others = seen([_about_vertical(angle) for angle in _QUARTERS])
+    ways = _Ways(understand, _probe(mesh))
+    as_it_is, *others = ways.seen([_about_vertical(angle) for angle in _QUARTERS])
     if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
-        return faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
-    best = min(seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
+        return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
+    best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
-    if understood and (ahead := faced(best)) is not best:
+    if understood and (ahead := ways.faced(best)) is not best:
         return ahead.stands
-    every = seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES])
-    along_axes, best = (min(some, key=lambda way: way.misfit) for some in (every[: _SIDES * len(_ANGLES)], every))
+    every = ways.seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES], _FIRST_VERTICES)
+    along_axes, best = (ways.best_of(some) for some in (every[: _SIDES * len(_ANGLES)], every))
+    best = min(along_axes, best, key=lambda way: way.misfit)
     for size in _TILTS:
         tilted = [_turn(axis, angle) @ best.way for axis in np.eye(3) for angle in (-size, size)]
-        best = min(seen([best.way, *tilted]), key=lambda way: way.misfit)
-    found, upright = faced(along_axes), turned(best, lambda found: found.root.T)
+        best = min(ways.seen([best.way, *tilted]), key=lambda way: way.misfit)
+    found, upright = ways.faced(along_axes), ways.turned(best, lambda found: found.root.T)
     likely = _CLEARLY * upright.misfit < as_it_is.misfit and upright.misfit <= _CLEARLY * found.misfit
     if likely and _leaning(upright.way.T) <= _LEANS:
         return upright.leans
@@ -207,6 +193,33 @@ class _Seen(NamedTuple):
         facing = _facing(self.way.T)
         about = _about_vertical(-facing if abs(facing) > _STRAIGHT else 0.0)
         return Standing(about, self.misfit, lean=about @ self.way.T)
+
+
+class _Ways:
+    """Ways to turn the points [n, 3] of a mesh, and what a network understands of it then."""
+
+    def __init__(self, understand: Understanding, points: Floats) -> None:
+        self._understand, self._points = understand, points
+
+    def seen(self, ways: Sequence[NDArray[np.float64]], vertices: int = _VERTICES) -> list[_Seen]:
+        misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T)[:vertices] for way in ways]))
+        return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
+
+    def best_of(self, ranked: Sequence[_Seen]) -> _Seen:
+        """The way with the least misfit of those that a few vertices rank first."""
+        likely = sorted(ranked, key=lambda way: way.misfit)[:_KEPT]
+        return min(self.seen([each.way for each in likely]), key=lambda way: way.misfit)
+
+    def turned(self, found: _Seen, undone: Callable[[_Seen], NDArray[np.float64]]) -> _Seen:
+        """The way turned by what undoes the root's turn, as far as the network can say."""
+        for _ in range(_TURNS):
+            found = self.seen([undone(found) @ found.way])[0]
+        return found
+
+    def faced(self, found: _Seen) -> _Seen:
+        """The way turned about the vertical until the body faces +Z; left where that is misread, as where it leans."""
+        ahead = self.turned(found, lambda found: _about_vertical(-found.facing))
+        return ahead if ahead.misfit <= max(KNOWN, found.misfit) else found
 
 
 def _facing(root: NDArray[np.float64]) -> float:

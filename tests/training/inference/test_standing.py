@@ -12,10 +12,16 @@ BODY = RANDOM.normal(size=(60, 3)) * (0.3, 1, 0.2)
 ORDER = np.random.default_rng(0).permutation(60)  # as its vertices are drawn
 
 
+def turns_of(meshes: NDArray[np.floating]) -> list[Rotation]:
+    """How each of some meshes, of the first vertices that are drawn, is turned from upright."""
+    known = BODY[ORDER[: meshes.shape[1]]]
+    known = known - known.mean(axis=0)
+    return [Rotation.align_vectors(mesh - mesh.mean(axis=0), known)[0] for mesh in meshes]
+
+
 def understand(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Misfit grows with the angle from upright; how it is turned is known to 40 degrees, as it is to a network."""
-    known = BODY[ORDER] - BODY.mean(axis=0)
-    turns = [Rotation.align_vectors(mesh - mesh.mean(axis=0), known)[0] for mesh in meshes]
+    turns = turns_of(meshes)
     angles = np.array([turn.magnitude() for turn in turns])
     known_to = np.radians(40)
     roots = [turn.as_matrix() if turn.magnitude() < known_to else np.eye(3) for turn in turns]
@@ -24,8 +30,7 @@ def understand(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArr
 
 def understand_in_part(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """As `understand`, but of a larger turn 25 degrees are read."""
-    known = BODY[ORDER] - BODY.mean(axis=0)
-    vectors = np.stack([Rotation.align_vectors(mesh - mesh.mean(axis=0), known)[0].as_rotvec() for mesh in meshes])
+    vectors = np.stack([turn.as_rotvec() for turn in turns_of(meshes)])
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     read = vectors * np.minimum(1, np.radians(25) / np.maximum(angles, 1e-9))
     return understand(meshes)[0], Rotation.from_rotvec(read).as_matrix()
@@ -33,9 +38,7 @@ def understand_in_part(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64
 
 def understand_leaning(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """As `understand`, but bodies that lean by up to 20 degrees are as well understood as upright ones."""
-    known = BODY[ORDER] - BODY.mean(axis=0)
-    turns = [Rotation.align_vectors(mesh - mesh.mean(axis=0), known)[0] for mesh in meshes]
-    angles = np.maximum(0, [turn.magnitude() - np.radians(20) for turn in turns])
+    angles = np.maximum(0, [turn.magnitude() - np.radians(20) for turn in turns_of(meshes)])
     return 0.0005 + 0.02 * (1 - np.cos(angles)), understand(meshes)[1]
 
 
