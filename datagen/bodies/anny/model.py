@@ -11,6 +11,8 @@ import io
 import os
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +56,7 @@ class AnnyModel:
         self._weights = scipy.sparse.csr_array(weights[:, self._bones.order])
         heads = model.template_bone_heads.numpy()[self._bones.order]
         self._corrections = t_pose_corrections(self._bones, _y_up(heads))
+        self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Phenotypes as the recipe's ``ages`` says, within its ranges, then local changes."""
@@ -89,10 +92,16 @@ class AnnyModel:
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """The bones that carry a pose joint; twist bones, metacarpals and the like are folded into these."""
-        drivers = drivers_of(self._bones.joints, self._bones.parents, joints)
+        shared, kept = self._shared_rig(joints)
         heads = _y_up(self._shape.heads(tuple(parameters.tolist())))[self._bones.order]
-        rest = Rest(np.empty((0, 3)), heads, self._weights, self._bones.parents)
-        return rig_of(rest, self._bones.labels, drivers, self._corrections)
+        return replace(shared, joints=heads[kept].astype(np.float32))
+
+    def _rig_but_joints(self, joints: tuple[str, ...]) -> tuple[Rig, list[int]]:
+        """What the rigs of all identities share, and the bones whose heads are its joints."""
+        drivers = drivers_of(self._bones.joints, self._bones.parents, joints)
+        rest = Rest(np.empty((0, 3)), np.zeros((len(drivers), 3)), self._weights, self._bones.parents)
+        rig = rig_of(rest, self._bones.labels, drivers, self._corrections)
+        return rig, [self._bones.labels.index(name) for name in rig.names]
 
     def t_pose(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Vertices [vertex, 3] and bone heads [bone, 3] in SMPL's T-pose, which is no pose of the rig's own."""
