@@ -48,7 +48,8 @@ def _server(database: Path, port: int) -> list[str]:
     return [
         *(sys.executable, "-m", "mlflow", "ui", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"),
         *("--uvicorn-opts", "--log-level warning"),
-        *("--backend-store-uri", server.uri, "--artifacts-destination", str(server.artifacts)),
+        *("--backend-store-uri", server.uri, "--registry-store-uri", server.uri),
+        *("--artifacts-destination", str(server.artifacts)),
     ]
 
 
