@@ -43,7 +43,7 @@ def understanding_of(network: Parts) -> Understanding:
 MISREAD = 9.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
 animals that were read rightly by weights of their kind have less; all else has more but for a table or an animal by
-weights of people, and a person in a dress by those of animals (docs/transfer.md)."""
+weights of people, and people in a coat or on all fours by those of animals (docs/transfer.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands; bare people have 0.0014 at most (docs/transfer.md)."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
@@ -98,16 +98,17 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
-    angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, and small turns of
-    the best. Another way is taken where it is clearly better understood. A body whose way upward is at most 50 degrees
-    from the file's Y then leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
-    axes is taken where it is clearly better than all along them: nothing but the body says which way is up then, so its
-    root is brought to rest. A lean that is understood is left, too (`facing`).
+    angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, which a few
+    vertices rank before the first of them are read as well as the others; and small turns of the best. Another way is
+    taken where it is clearly better understood. A body whose way upward is at most 50 degrees from the file's Y then
+    leans; as that may be the pose, it is said, not undone. Else a way between the mesh' axes is taken where it is
+    clearly better than all along them: nothing but the body says which way is up then, so its root is brought to rest.
+    A lean that is understood is left, too (`facing`).
 
     Parameters
     ----------
     mesh
-        Vertices [n, 3] in any unit; 256 of them are read.
+        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways.
     """
     ways = _Ways(understand, _probe(mesh))
     as_it_is, *others = ways.seen([_about_vertical(angle) for angle in _QUARTERS])
@@ -202,7 +203,7 @@ class _Ways:
         self._understand, self._points = understand, points
 
     def seen(self, ways: Sequence[NDArray[np.float64]], vertices: int = _VERTICES) -> list[_Seen]:
-        misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T)[:vertices] for way in ways]))
+        misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T, vertices) for way in ways]))
         return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
 
     def best_of(self, ranked: Sequence[_Seen]) -> _Seen:
@@ -252,6 +253,6 @@ def _probe(mesh: Floats) -> Floats:
     return mesh[np.random.default_rng(0).permutation(len(mesh))[:_LOOKED_AT]]
 
 
-def _boxed(probe: Floats) -> Floats:
+def _boxed(probe: Floats, vertices: int = _VERTICES) -> Floats:
     """Some of the vertices in the box of all."""
-    return bounding_box(probe).normalise(probe)[:_VERTICES]
+    return bounding_box(probe).normalise(probe)[:vertices]

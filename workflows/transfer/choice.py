@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 from datagen.common.errors import MeshError
@@ -39,8 +38,13 @@ class Chosen:
 
     @property
     def is_sure(self) -> bool:
-        """Whether both meshes are known well: other weights need not be asked."""
+        """Whether both meshes are known well."""
         return all(found.misfit <= KNOWN and found.rest_error <= MISREAD for found in self.standings)
+
+    def reads_better_than(self, other: "Chosen") -> bool:
+        """Whether both meshes have less rest error than by other weights."""
+        pairs = zip(self.standings, other.standings, strict=True)
+        return all(own.rest_error < theirs.rest_error for own, theirs in pairs)
 
 
 def standings(transfer: PoseTransfer, job: TransferJob, meshes: tuple[Mesh, Mesh]) -> Pair:
@@ -67,24 +71,23 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     """Return the weights that know both meshes best; of meshes that none knows, `human`.
 
     The others are not asked where `human` knows both well: among all the ways to turn an animal there may be one in
-    which it passes for a person, but worse by far than people do. Animals that stand as most files have them are known
-    before those ways are tried, which takes a second a mesh.
+    which it passes for a person, but worse by far than people do. Nor is `dressed` where `animals` knows both well, and
+    better than `human` does.
 
     Raises
     ------
     MeshError
         One is a person and one an animal, and it is not forced.
     """
-    load = cache(load or PoseTransfer.from_run)
-    if not _known_as_they_are("human", meshes, load) and _known_as_they_are("animals", meshes, load):
-        animals = Chosen.of(own_weights("animals"), job, meshes, load)
-        if animals.is_sure:
-            return animals
+    load = load or PoseTransfer.from_run
     people = Chosen.of(own_weights("human"), job, meshes, load)
     if people.is_sure:
         return people
-    others = [name for name in KINDS if name != "human"]
-    every = {"human": people} | {name: Chosen.of(own_weights(name), job, meshes, load) for name in others}
+    animals = Chosen.of(own_weights("animals"), job, meshes, load)
+    if animals.is_sure and animals.reads_better_than(people):
+        return animals
+    dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
+    every = {"human": people, "dressed": dressed, "animals": animals}
     errors = {name: [found.rest_error for found in each.standings] for name, each in every.items()}
     source, target = kinds = [_kind(errors, place) for place in range(2)]
     if source and target and source != target and not force:
@@ -103,11 +106,6 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         "" if target else f"{job.target} is {_neither(errors, 1)}; {reason}",
     )
     return replace(every[taken], doubts=doubts)
-
-
-def _known_as_they_are(name: str, meshes: tuple[Mesh, Mesh], load: Load) -> bool:
-    transfer = load(own_weights(name))
-    return all(transfer.misfit(mesh.vertices) <= KNOWN for mesh in meshes)
 
 
 Errors = dict[str, list[float]]
