@@ -1,5 +1,6 @@
 """Making the environment: which installer, from where, what it says meanwhile, what it leaves when it fails."""
 
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from tests.support.commands import ROOT
 
@@ -96,3 +98,10 @@ def test_an_environment_is_ready_only_when_all_was_installed(
     assert (Path(".venv") / ".ready").exists() is (status == 0)
     shown = capfd.readouterr()
     assert ("No matching distribution" in shown.err) is (status == 3)
+
+
+def test_every_package_that_is_installed_runs_on_the_oldest_python_that_is_promised() -> None:
+    """pip refuses all of them where one asks for more: Debian 12 has Python 3.11.2."""
+    for package in importlib.metadata.distributions():
+        needed = SpecifierSet(package.metadata["Requires-Python"] or "")
+        assert needed.contains("3.11.0"), f"{package.name} {package.version} needs Python {needed}: pin an older one"
