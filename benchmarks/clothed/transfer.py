@@ -27,7 +27,7 @@ from datagen.store import Dataset, open_dataset
 from training.data.batch import read_batch
 from training.evaluation.evaluate import Method, Row, evaluate, triples_in
 from training.evaluation.measure import SKINNED, Contender, outputs_of
-from training.evaluation.tables import COLUMNS, DRESSED_COLUMNS, Column
+from training.evaluation.tables import COLUMNS, DRESSED_COLUMNS, PARTS, Column, columns_of
 from training.recipes.training import EvaluationRecipe
 from training.viz.mesh_grid import Panel, mesh_grid, standing
 from training.viz.mesh_grid import Row as Drawn
@@ -134,6 +134,19 @@ def table(people: People, methods: Sequence[Method], rows: Sequence[Row]) -> Non
             )
 
 
+def table_by_part(people: People, rows: Sequence[Row]) -> None:
+    """One line for each outfit, part and method, as Markdown."""
+    print("| target | part | method |", " | ".join(its.heading for its in columns_of(PARTS[0])), "|")
+    print("|---|---|---|", "---:|" * len(columns_of(PARTS[0])), sep="")
+    for outfit in people.outfits:
+        its = [row for row in rows if people.worn(row.target_identity) == outfit]
+        for part in PARTS:
+            for method in dict.fromkeys(row.method for row in its):
+                ours = [row for row in its if row.method == method]
+                cells = [_mean(ours, column) for column in columns_of(part)]
+                print(f"| `{outfit}` | {part} | {method} |", " | ".join(cells), "|")
+
+
 def _cells(people: People, rows: Sequence[Row], columns: Sequence[Column]) -> list[str]:
     pmd, *others = columns
     bare = [row for row in rows if people.worn(row.source_identity) == _BARE]
@@ -197,7 +210,10 @@ if __name__ == "__main__":
     given = parser.parse_args()
     its_about = EvaluationRecipe(emd_points=_EMD_POINTS, triples=given.triples)
     its_people = People(open_dataset(given.data), its_about)
+    its_rows = measured(its_people, given.folder, given.methods)
     if given.what == "table":
-        table(its_people, given.methods, measured(its_people, given.folder, given.methods))
+        table(its_people, given.methods, its_rows)
+        print()
+        table_by_part(its_people, its_rows)
     else:
-        picture(its_people, given.methods, measured(its_people, given.folder, given.methods), given.picture)
+        picture(its_people, given.methods, its_rows, given.picture)

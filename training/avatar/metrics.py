@@ -15,7 +15,9 @@ cosine               half the sum of the absolute values of both mean cosines   
                      between normals of samples and of the nearest sample
 ===================  ===========================================================  ========
 
-The last two are those of the released code. Figures depend on the number of samples: compare those of one number only.
+The last two are those of the released code, which makes a surface of the model's points and normals before it measures;
+ours has faces, and its samples have the normals n between its vertices, those that the model predicts. Figures depend
+on the number of samples: compare those of one number only.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ class Surface:
     mesh
         What was sampled, in metres.
     points, normals
-        Of the samples ``[n, 3]``; normals are those of their triangles.
+        Of the samples ``[n, 3]``; normals are those of their triangles, or between those of the vertices.
     faces
         Number of each sample's triangle ``[n]``.
     """
@@ -55,8 +57,8 @@ class Surface:
     faces: NDArray[np.int64]
 
     @classmethod
-    def sampled(cls, mesh: Mesh, count: int, *, seed: int = 0) -> Surface:
-        """Return ``count`` samples of a mesh."""
+    def sampled(cls, mesh: Mesh, count: int, *, normals: Floats | None = None, seed: int = 0) -> Surface:
+        """Return ``count`` samples of a mesh, whose vertices may have normals ``[vertex, 3]`` of length one."""
         random = np.random.default_rng(seed)
         corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -65,7 +67,11 @@ class Surface:
         first, second = np.sqrt(random.random(count)), random.random(count)
         shares = np.stack([1 - first, first * (1 - second), first * second], axis=1)
         points = (shares[:, :, None] * corners[faces]).sum(axis=1)
-        return cls(mesh, points, across[faces] / areas[faces, None], faces)
+        of_faces = across[faces] / areas[faces, None]
+        if normals is None:
+            return cls(mesh, points, of_faces, faces)
+        between = (shares[:, :, None] * np.asarray(normals, np.float64)[mesh.faces[faces]]).sum(axis=1)
+        return cls(mesh, points, between / np.linalg.norm(between, axis=1, keepdims=True).clip(1e-12), faces)
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -125,7 +131,8 @@ def score(
     parts
         Label ``[vertex]`` of each of the scan's vertices; what is nearest to a part counts as of it. None: no parts.
     """
-    of_model, of_scan = (Surface.sampled(mesh, samples, seed=seed) for mesh in (model, scan))
+    of_model = Surface.sampled(model, samples, normals=normals, seed=seed)
+    of_scan = Surface.sampled(scan, samples, seed=seed)
     vertices = np.asarray(model.vertices, np.float64)
     here = of_scan.nearest(vertices)
     plane = np.abs(((of_scan.points[here] - vertices) * of_scan.normals[here]).sum(axis=1))

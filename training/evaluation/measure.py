@@ -160,16 +160,22 @@ def _measure_each(
         ours, right = output[group.places, : group.count], truth[group.places, : group.count]
         about: dict[str, Any] = {"emd_points": recipe.emd_points, "seed": recipe.seed}
         scores = measure(ours, right, edges=group.edges, faces=group.faces, metres=group.metres, **about)
-        found |= zip(group.places, zip(scores, _by_part(group, ours, right), strict=True), strict=True)
+        dressed = [Dressed()] * len(ours)
+        if group.is_garment is not None:
+            skin, garment = (_of_part(group, its, ours, right, about) for its in (~group.is_garment, group.is_garment))
+            dressed = [Dressed(*one, *other) for one, other in zip(skin, garment, strict=True)]
+        found |= zip(group.places, zip(scores, dressed, strict=True), strict=True)
     return [found[place] for place in range(len(found))]
 
 
-def _by_part(group: _Group, output: Tensor, truth: Tensor) -> list[Dressed]:
-    if group.is_garment is None:
-        return [Dressed()] * len(output)
-    parts = (~group.is_garment, group.is_garment)
-    errors = (metrics.mean_euclidean_error(output[:, its], truth[:, its]) * group.metres * 1000 for its in parts)
-    return [Dressed(*values) for values in zip(*(its.tolist() for its in errors), strict=True)]
+def _of_part(group: _Group, part: Tensor, output: Tensor, truth: Tensor, about: dict[str, Any]) -> list[list[float]]:
+    """Metrics of the vertices of a ``part`` [vertex] as a mesh of their own, in the order of `Dressed`."""
+    number = part.cumsum(0) - 1
+    edges, faces = (number[each[part[each].all(dim=1)]] for each in (group.edges, group.faces))
+    scores = measure(output[:, part], truth[:, part], edges=edges, faces=faces, metres=group.metres, **about)
+    return [
+        [its.pmd, its.chamfer, its.earth_mover, its.millimetres, its.edge_ratio, its.normal_degrees] for its in scores
+    ]
 
 
 def measure(

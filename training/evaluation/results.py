@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,10 +37,11 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def write_csv(rows: Sequence[Any], path: Path, kind: type[Any]) -> None:
-    """Write rows of a dataclass; the file appears whole or not at all."""
+def write_csv(rows: Sequence[Any], path: Path, kind: type[Any], *, without: Collection[str] = ()) -> None:
+    """Write rows of a dataclass, ``without`` some fields; the file appears whole or not at all."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(kind)])
+    names = [field.name for field in fields(kind) if field.name not in without]
+    writer = csv.DictWriter(text, names, extrasaction="ignore")
     writer.writeheader()
     writer.writerows({name: inert(value) for name, value in asdict(row).items()} for row in rows)
     write_atomically(path, text.getvalue().encode(errors="backslashreplace"))
@@ -105,10 +106,23 @@ class Score:
 
 @dataclass(frozen=True, order=True)
 class Dressed:
-    """Mean Euclidean error of the skin and of the garments of a dressed target, in millimetres; 0 of a bare one."""
+    """Metrics of the skin and of the garments of a dressed target, each as a mesh of its own; 0 of a bare one.
 
+    Units are those of :class:`Score`: the whole target's box. Edges and faces between both belong to neither.
+    """
+
+    skin_pmd: float = 0.0
+    skin_chamfer: float = 0.0
+    skin_earth_mover: float = 0.0
     skin_millimetres: float = 0.0
+    skin_edge_ratio: float = 0.0
+    skin_normal_degrees: float = 0.0
+    garment_pmd: float = 0.0
+    garment_chamfer: float = 0.0
+    garment_earth_mover: float = 0.0
     garment_millimetres: float = 0.0
+    garment_edge_ratio: float = 0.0
+    garment_normal_degrees: float = 0.0
 
 
 @dataclass(frozen=True, order=True)
@@ -136,8 +150,9 @@ class Row(Dressed, Score, Triple, Listed):
 
 
 def write_rows(rows: list[Row], path: Path) -> None:
-    """Write rows as CSV, at once."""
-    write_csv(rows, path, Row)
+    """Write rows as CSV, at once; without columns of garments where nobody wears any."""
+    dressed = any(row.garment_millimetres for row in rows)
+    write_csv(rows, path, Row, without=() if dressed else [field.name for field in fields(Dressed)])
 
 
 def read_rows(path: Path) -> list[Row]:
