@@ -8,22 +8,22 @@ of the ground, so that a body that sits down sits on the ground on which it stoo
 paper's normalisation suggests, would let it float at the height of its hips.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
 from training.inference.orientation import UPRIGHT, Axes
-from training.inference.predict import load_trained, surfaces_of
+from training.inference.predict import load_trained, surface_of_meshes, surfaces_of, takes_surfaces
 from training.inference.projection import OntoParts
 from training.inference.standing import Standing, facing, misfit, rest_error, standing, understanding_of
-from training.networks.execution import GraphedTransfer, Precision
+from training.networks.execution import GraphedTransfer, products
 from training.networks.layers.surface import Surface
 from training.networks.parts import Parts
 from training.objectives.metrics import point_mesh_distance
@@ -45,16 +45,16 @@ class PoseTransfer:
     >>> for frame in transfer.sequence(walk, target.mesh, smooth=7): ...    # doctest: +SKIP
     """
 
-    def __init__(self, network: nn.Module, *, precision: Precision = "float32") -> None:
+    def __init__(self, network: nn.Module) -> None:
         """Use a network where it is.
 
         On a GPU shapes that come again are replayed (see :class:`GraphedTransfer`), but for networks that are told of
         surfaces.
         """
-        self._transfer = GraphedTransfer(network.eval(), precision=precision)
+        self._transfer = GraphedTransfer(network.eval())
         self._bare, self._parts = self._transfer, network if isinstance(network, Parts) else None
         if isinstance(network, OntoParts):
-            self._bare, self._parts = GraphedTransfer(network.network, precision=precision), network.parts
+            self._bare, self._parts = GraphedTransfer(network.network), network.parts
         self._network = network
         self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
 
@@ -167,10 +167,38 @@ class PoseTransfer:
 
         ``surfaces`` are what :func:`training.inference.predict.surfaces_of` says of the meshes.
         """
-        pair = [bounding_box(mesh).normalise(mesh).astype(np.float32)[None] for mesh in (source, target)]
-        inputs = [torch.from_numpy(mesh).to(self._device) for mesh in pair]
-        output = self._transfer(source=inputs[0], target=inputs[1], **surfaces)
+        output = self._transfer(source=self._boxed(source), target=self._boxed(target), **surfaces)
         return output[0].double().cpu().numpy()
+
+    @torch.no_grad()
+    def _poser(self, own: Floats, target: Mesh) -> Callable[[Floats, Mesh], NDArray[np.float64]]:
+        """Return what poses vertices ``own`` [n, 3] of the target as sources' vertices [m, 3] are, unplaced.
+
+        Sources come with their mesh as it stands. What is read of the target alone, and what is near along the surface
+        of meshes that list the same faces, is found once.
+        """
+        network, of_target, of_source, first = self._network, None, None, target
+        if takes_surfaces(network):
+            of_target = of_source = surface_of_meshes([target]).to(self._device)
+        with products("float32"):
+            read = network.read_target(self._boxed(own), of_target) if isinstance(network, Parts) else None
+
+        @torch.no_grad()
+        def posed(source: Floats, mesh: Mesh) -> NDArray[np.float64]:
+            nonlocal of_source, first
+            if of_target is not None and (first is target or not _is_same_mesh(mesh, first)):
+                of_source, first = surface_of_meshes([mesh]).to(self._device), mesh
+            if isinstance(network, Parts) and read:
+                with products("float32"):
+                    return network.posed_target(self._boxed(source), read, of_source)[0].double().cpu().numpy()
+            told = {"source_surface": of_source, "target_surface": of_target} if of_source and of_target else {}
+            return self.vertices(source, own, **told)
+
+        return posed
+
+    def _boxed(self, vertices: Floats) -> Tensor:
+        """Vertices [1, n, 3] in their normalised box, where the network is."""
+        return torch.from_numpy(bounding_box(vertices).normalise(vertices).astype(np.float32)[None]).to(self._device)
 
     @torch.no_grad()
     def self_errors(self, meshes: Floats) -> NDArray[np.float64]:
@@ -209,8 +237,9 @@ class PoseTransfer:
     ) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up; the target leans, but for what is found here."""
         trajectory: RootTrajectory | None = None
-        turn, surfaces, first = np.eye(3), dict[str, Surface](), None
+        turn = np.eye(3)
         own = target.vertices @ self._turned_round(target.vertices, lean)  # how it leans is of its pose, and goes
+        posed = self._poser(own, target)
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
             if number == 0:  # the others may turn round and bend
@@ -218,12 +247,9 @@ class PoseTransfer:
                 turn = axes.lean
             assert axes is not None
             vertices = axes.turned(mesh.vertices)
-            if first is None or not _is_same_mesh(mesh, first):  # else what is near stays so from pose to pose
-                first = mesh
-                surfaces = surfaces_of(self._network, sources=[Mesh(vertices, mesh.faces)], targets=[target])
             turn = self._turned_round(vertices, turn)
             read = vertices @ turn
-            output = self.vertices(read, own, **surfaces) @ turn.T
+            output = posed(read, Mesh(vertices, mesh.faces)) @ turn.T
             trajectory = trajectory or RootTrajectory(
                 standing_point(vertices), scale_of(target, output) / float(bounding_box(read).half)
             )

@@ -56,6 +56,15 @@ class Reading(NamedTuple):
     joints: Tensor
 
 
+class ReadTarget(NamedTuple):
+    """A target as it was read (:meth:`Parts.read_target`): vertices [b, n, 3], their weights [b, n, part]."""
+
+    vertices: Tensor
+    drawn: Sample
+    weights: Tensor
+    reading: Reading
+
+
 class Parts(nn.Module):
     """The parts network.
 
@@ -143,7 +152,19 @@ class Parts(nn.Module):
             if self.training:
                 surfaces = (source_surface, target_surface) if source_surface and target_surface else None
                 return self.posed_like(target, self.read_pair(source, target, surfaces))
-            return self._corrected(sample(source, source_surface), target, sample(target, target_surface))
+        return self.posed_target(source, self.read_target(target, target_surface), source_surface)
+
+    def read_target(self, target: Tensor, surface: Surface | None = None) -> ReadTarget:
+        """Return what is read off targets [b, n, 3] in their normalised boxes: once for any number of sources."""
+        with full_precision(target):
+            drawn = sample(target, surface)
+            reading = self.read(target, drawn)
+            return ReadTarget(target, drawn, reading.logits.softmax(2), reading)
+
+    def posed_target(self, source: Tensor, target: ReadTarget, surface: Surface | None = None) -> Tensor:
+        """Return what calling the network outside of training does, of targets that were read before."""
+        with full_precision(source):
+            return self._corrected(sample(source, surface), target)
 
     def read(self, vertices: Tensor, drawn: Sample) -> Reading:
         """Return what is read off vertices [b, n, 3], among which a sample was drawn, in training mode or not."""
@@ -213,19 +234,18 @@ class Parts(nn.Module):
         moved = moved_joints(joints, turns, self.parents, self.above)
         return boxed(skinned(vertices, weights, turns, joints, moved))
 
-    def _corrected(self, source: Sample, target: Tensor, drawn: Sample) -> Tensor:
+    def _corrected(self, source: Sample, target: ReadTarget) -> Tensor:
         wanted = self.read(source.vertices, source).rotations
-        own = self.read(target, drawn)
-        weights = own.logits.softmax(2)
+        vertices, drawn, weights, own = target
         turns = wanted @ own.rotations.mT
 
         def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
             found = self._read_again(taken(output, drawn.rows), drawn).rotations
             return found, (wanted - found).square().sum((1, 2, 3))
 
-        output = self.posed(target, weights, own.joints, turns)
+        output = self.posed(vertices, weights, own.joints, turns)
         found, missing = read_again(output)
-        corrected = self.posed(target, weights, own.joints, wanted @ found.mT @ turns)
+        corrected = self.posed(vertices, weights, own.joints, wanted @ found.mT @ turns)
         is_better = read_again(corrected)[1] <= missing
         return torch.where(is_better[:, None, None], corrected, output)
 

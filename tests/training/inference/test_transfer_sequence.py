@@ -14,8 +14,9 @@ from datagen.mesh.geometry import Mesh, bounding_box, standing_point
 from tests.support.three_networks import lively
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.smoothing import smoothed
-from training.inference.transfer import PoseTransfer
+from training.inference.transfer import PoseTransfer, placed
 from training.networks import build_network
+from training.networks.parts import Parts
 
 FACES = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
 
@@ -54,6 +55,19 @@ def test_frames_may_have_more_vertices_though_the_same_faces_and_stand_otherwise
     again = transfer.sequence(lying, target, source_axes=axes, target_axes=UPRIGHT)
     for one, other in zip(upright, again, strict=True):
         np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-4)
+
+
+def test_a_target_is_read_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    transfer, reads = PoseTransfer(lively("parts")), []
+    read_target = Parts.read_target
+    monkeypatch.setattr(Parts, "read_target", lambda *given: reads.append(given) or read_target(*given))
+    monkeypatch.setattr(transfer, "_turned_round", lambda vertices, before: np.eye(3))
+    sources, target = [mesh_of(1), mesh_of(3), mesh_of(4, 50)], mesh_of(2)
+    frames = list(transfer.sequence(sources, target, source_axes=UPRIGHT, target_axes=UPRIGHT))
+    assert len(reads) == 1
+    for frame, source in zip(frames, sources, strict=True):
+        moved = frame.vertices - placed(target, transfer.unplaced(source, target))
+        np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-6)  # the way through space
 
 
 def test_the_output_stands_on_the_ground_of_the_target() -> None:
