@@ -25,8 +25,10 @@ from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
 from training.data.vertex_layout import read_each
 from training.evaluation.results import Dressed, Row, Score
-from training.inference.predict import load_trained, predict, surfaces_of, takes_surfaces
+from training.inference.mesh_reading import boxed, posed_like, read_targets, surfaces_of, takes_surfaces
+from training.inference.predict import load_trained, predict
 from training.inference.projection import OntoParts
+from training.networks.parts import Parts
 from training.objectives import metrics
 from training.recipes.training import EvaluationRecipe
 
@@ -280,12 +282,15 @@ def transfer_each(network: nn.Module, pairs: Iterable[tuple[Mesh, Mesh]]) -> Ite
         alike, at_once = list(run), max(1, _POINTS_AT_ONCE // sum(counts))
         for start in range(0, len(alike), at_once):
             sources, targets = zip(*alike[start : start + at_once], strict=True)
-            told = surfaces_of(network, sources=sources, targets=targets)
-            yield from network(source=_stacked(sources), target=_stacked(targets), **told).double().numpy()
+            yield from _transferred(network, sources, targets).double().numpy()
 
 
-def _stacked(meshes: Sequence[Mesh]) -> Tensor:
-    return torch.from_numpy(np.stack([normalised(mesh.vertices) for mesh in meshes]))
+def _transferred(network: nn.Module, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> Tensor:
+    if isinstance(network, Parts):
+        return posed_like(network, sources, read_targets(network, targets))
+    told = surfaces_of(network, sources=sources, targets=targets)
+    output: Tensor = network(source=boxed(network, sources), target=boxed(network, targets), **told)
+    return output
 
 
 def score(

@@ -1,18 +1,17 @@
 """Networks from recipes and checkpoints, and running them over meshes."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from datagen.mesh.geometry import Mesh, edges_of
 from training.checkpoints.checkpoint import Checkpoint, Which, recipe_of, require_checkpoint
 from training.checkpoints.weights import fill_network
+from training.inference.mesh_reading import takes_surfaces
 from training.networks import network_from
 from training.networks.execution import GraphedTransfer
-from training.networks.layers.surface import Surface, joined, surface_of
+from training.networks.layers.surface import Surface
 from training.recipes.training import TrainingRecipe
 
 if TYPE_CHECKING:
@@ -68,27 +67,6 @@ def _told(network: nn.Module, batch: "Batch") -> dict[str, Surface]:
     if not takes_surfaces(network) or batch.surfaces is None:
         return {}
     return {"source_surface": batch.surfaces[0], "target_surface": batch.surfaces[1]}
-
-
-def surfaces_of(network: nn.Module, *, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> dict[str, Surface]:
-    """What a network takes beside the vertices of meshes: keyword arguments, none for the networks of the papers."""
-    if not takes_surfaces(network):
-        return {}
-    device = next(network.parameters()).device
-    return {
-        "source_surface": surface_of_meshes(sources).to(device),
-        "target_surface": surface_of_meshes(targets).to(device),
-    }
-
-
-def takes_surfaces(network: nn.Module) -> bool:
-    """Whether a network is told what is near along the surfaces of its meshes (`training.networks.NETWORKS`)."""
-    return bool(getattr(network, "takes_surfaces", False))
-
-
-def surface_of_meshes(meshes: Sequence[Mesh]) -> Surface:
-    """What is near along the surfaces of meshes."""
-    return joined([surface_of(mesh.vertices, edges_of(mesh.faces)) for mesh in meshes])
 
 
 def _predict_mixed(network: nn.Module, batch: "Batch") -> Tensor:

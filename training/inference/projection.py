@@ -70,7 +70,7 @@ class OntoParts(nn.Module):
     def forward(self, *, source: Tensor, target: Tensor, **surfaces: Surface) -> Tensor:
         """Return ``[b, n_target, 3]`` for ``[b, n_source, 3]`` and ``[b, n_target, 3]``, each in its normalised box.
 
-        Of the ``surfaces`` that :func:`training.inference.predict.surfaces_of` finds, the target's is read.
+        Of the ``surfaces`` that :func:`training.inference.mesh_reading.surfaces_of` finds, the target's is read.
         """
         output = self.network(source=source, target=target)
         with full_precision(target):

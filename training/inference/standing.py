@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box
-from training.inference.predict import surface_of_meshes
+from training.inference.mesh_reading import surface_of_meshes
 from training.networks.layers.sampling import Sample, sample
 from training.networks.parts import Parts
 

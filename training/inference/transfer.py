@@ -19,8 +19,9 @@ from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
+from training.inference.mesh_reading import posed_like, read_targets, surface_of_meshes, takes_surfaces
 from training.inference.orientation import UPRIGHT, Axes
-from training.inference.predict import load_trained, surface_of_meshes, surfaces_of, takes_surfaces
+from training.inference.predict import load_trained
 from training.inference.projection import OntoParts
 from training.inference.standing import Standing, facing, misfit, rest_error, standing, understanding_of
 from training.networks.execution import GraphedTransfer, products
@@ -158,41 +159,37 @@ class PoseTransfer:
 
     def unplaced(self, source: Mesh, target: Mesh) -> NDArray[np.float64]:
         """Posed vertices [n_target, 3] in the normalised box, of meshes that are usable and stand upright."""
-        surfaces = surfaces_of(self._network, sources=[source], targets=[target])
-        return self.vertices(source.vertices, target.vertices, **surfaces)
+        return self._poser(target)(source)
 
     @torch.no_grad()
     def vertices(self, source: Floats, target: Floats, **surfaces: Surface) -> NDArray[np.float64]:
         """Posed vertices [n_target, 3] in the normalised box, from vertices [n_source, 3] and [n_target, 3].
 
-        ``surfaces`` are what :func:`training.inference.predict.surfaces_of` says of the meshes.
+        ``surfaces`` are what :func:`training.inference.mesh_reading.surfaces_of` says of the meshes.
         """
         output = self._transfer(source=self._boxed(source), target=self._boxed(target), **surfaces)
         return output[0].double().cpu().numpy()
 
-    @torch.no_grad()
-    def _poser(self, own: Floats, target: Mesh) -> Callable[[Floats, Mesh], NDArray[np.float64]]:
-        """Return what poses vertices ``own`` [n, 3] of the target as sources' vertices [m, 3] are, unplaced.
+    def _poser(self, target: Mesh) -> Callable[[Mesh], NDArray[np.float64]]:
+        """Return what poses the target as sources are, unplaced.
 
-        Sources come with their mesh as it stands. What is read of the target alone, and what is near along the surface
-        of meshes that list the same faces, is found once.
+        What is read of the target alone, and what is near along the surface of sources that list the same faces, is
+        found once.
         """
-        network, of_target, of_source, first = self._network, None, None, target
-        if takes_surfaces(network):
-            of_target = of_source = surface_of_meshes([target]).to(self._device)
+        network, first, of_source = self._network, None, None
         with products("float32"):
-            read = network.read_target(self._boxed(own), of_target) if isinstance(network, Parts) else None
+            read = read_targets(network, [target]) if isinstance(network, Parts) else None
+        of_target = surface_of_meshes([target]).to(self._device) if takes_surfaces(network) and read is None else None
 
-        @torch.no_grad()
-        def posed(source: Floats, mesh: Mesh) -> NDArray[np.float64]:
+        def posed(source: Mesh) -> NDArray[np.float64]:
             nonlocal of_source, first
-            if of_target is not None and (first is target or not _is_same_mesh(mesh, first)):
-                of_source, first = surface_of_meshes([mesh]).to(self._device), mesh
+            if takes_surfaces(network) and (first is None or not _is_same_mesh(source, first)):
+                of_source, first = surface_of_meshes([source]).to(self._device), source
             if isinstance(network, Parts) and read:
                 with products("float32"):
-                    return network.posed_target(self._boxed(source), read, of_source)[0].double().cpu().numpy()
+                    return posed_like(network, [source], read, of_source)[0].double().cpu().numpy()
             told = {"source_surface": of_source, "target_surface": of_target} if of_source and of_target else {}
-            return self.vertices(source, own, **told)
+            return self.vertices(source.vertices, target.vertices, **told)
 
         return posed
 
@@ -239,7 +236,7 @@ class PoseTransfer:
         trajectory: RootTrajectory | None = None
         turn = np.eye(3)
         own = target.vertices @ self._turned_round(target.vertices, lean)  # how it leans is of its pose, and goes
-        posed = self._poser(own, target)
+        posed = self._poser(Mesh(own, target.faces))
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
             if number == 0:  # the others may turn round and bend
@@ -249,7 +246,7 @@ class PoseTransfer:
             vertices = axes.turned(mesh.vertices)
             turn = self._turned_round(vertices, turn)
             read = vertices @ turn
-            output = posed(read, Mesh(vertices, mesh.faces)) @ turn.T
+            output = posed(Mesh(read, mesh.faces)) @ turn.T
             trajectory = trajectory or RootTrajectory(
                 standing_point(vertices), scale_of(target, output) / float(bounding_box(read).half)
             )

@@ -57,9 +57,20 @@ class Reading(NamedTuple):
 
 
 class ReadTarget(NamedTuple):
-    """A target as it was read (:meth:`Parts.read_target`): vertices [b, n, 3], their weights [b, n, part]."""
+    """A target as it was read (:meth:`Parts.read_target`).
+
+    Attributes
+    ----------
+    vertices, as_read
+        [b, n, 3], what is posed and what was read.
+    drawn
+        The sample of what was read.
+    weights
+        By which vertices are posed [b, n, part].
+    """
 
     vertices: Tensor
+    as_read: Tensor
     drawn: Sample
     weights: Tensor
     reading: Reading
@@ -154,12 +165,18 @@ class Parts(nn.Module):
                 return self.posed_like(target, self.read_pair(source, target, surfaces))
         return self.posed_target(source, self.read_target(target, target_surface), source_surface)
 
-    def read_target(self, target: Tensor, surface: Surface | None = None) -> ReadTarget:
-        """Return what is read off targets [b, n, 3] in their normalised boxes: once for any number of sources."""
+    def read_target(
+        self, target: Tensor, surface: Surface | None = None, *, as_read: Tensor | None = None
+    ) -> ReadTarget:
+        """Return what is read off targets [b, n, 3] in their normalised boxes: once for any number of sources.
+
+        ``as_read``: where their vertices are to be read, without noise, say; by default where they are.
+        """
+        read = target if as_read is None else as_read
         with full_precision(target):
-            drawn = sample(target, surface)
-            reading = self.read(target, drawn)
-            return ReadTarget(target, drawn, reading.logits.softmax(2), reading)
+            drawn = sample(read, surface)
+            reading = self.read(read, drawn)
+            return ReadTarget(target, read, drawn, reading.logits.softmax(2), reading)
 
     def posed_target(self, source: Tensor, target: ReadTarget, surface: Surface | None = None) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before."""
@@ -236,18 +253,18 @@ class Parts(nn.Module):
 
     def _corrected(self, source: Sample, target: ReadTarget) -> Tensor:
         wanted = self.read(source.vertices, source).rotations
-        vertices, drawn, weights, own = target
+        vertices, as_read, drawn, weights, own = target
         turns = wanted @ own.rotations.mT
 
-        def read_again(output: Tensor) -> tuple[Tensor, Tensor]:
-            found = self._read_again(taken(output, drawn.rows), drawn).rotations
+        def read_again(turns: Tensor) -> tuple[Tensor, Tensor]:
+            posed = self.posed(as_read, weights, own.joints, turns)
+            found = self._read_again(taken(posed, drawn.rows), drawn).rotations
             return found, (wanted - found).square().sum((1, 2, 3))
 
-        output = self.posed(vertices, weights, own.joints, turns)
-        found, missing = read_again(output)
-        corrected = self.posed(vertices, weights, own.joints, wanted @ found.mT @ turns)
+        found, missing = read_again(turns)
+        corrected = wanted @ found.mT @ turns
         is_better = read_again(corrected)[1] <= missing
-        return torch.where(is_better[:, None, None], corrected, output)
+        return self.posed(vertices, weights, own.joints, torch.where(is_better[:, None, None, None], corrected, turns))
 
     def _read_again(self, moved: Tensor, drawn: Sample) -> Reading:
         """Return what is read off the sample's vertices [b, k, 3] where they came to lie."""

@@ -14,7 +14,8 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.store import Dataset
 from training.data.batch import read_batch
 from training.evaluation.evaluate import POSE_TYPES, Row, evaluation_list
-from training.inference.predict import predict, takes_surfaces
+from training.inference.mesh_reading import takes_surfaces
+from training.inference.predict import predict
 from training.recipes.training import EvaluationRecipe
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_example import Comparison

@@ -116,6 +116,15 @@ def test_another_sampling_of_the_source_changes_little(human: PoseTransfer) -> N
     assert other < 1.5 * one + 0.0001
 
 
+def test_noise_of_a_source_is_mostly_filtered(human: PoseTransfer) -> None:
+    case = people(poses=7)
+    faces, random = case.target.faces, np.random.default_rng(0)
+    rough = [Mesh(each + random.normal(0, 0.017, each.shape), faces) for each in case.sources[1:]]
+    error = pmd(np.stack([human.unplaced(mesh, case.target) for mesh in rough]), case.truths[1:])
+    unfiltered = pmd(np.stack([human.vertices(mesh.vertices, case.target.vertices) for mesh in rough]), case.truths[1:])
+    assert error < 0.9 * unfiltered and error < 0.0003
+
+
 def test_what_is_no_person_is_said_to_be_strange(human: PoseTransfer) -> None:
     box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), np.array([[0, 1, 2]]))
     found = human.standing(box.vertices)

@@ -60,7 +60,7 @@ def test_frames_may_have_more_vertices_though_the_same_faces_and_stand_otherwise
 def test_a_target_is_read_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     transfer, reads = PoseTransfer(lively("parts")), []
     read_target = Parts.read_target
-    monkeypatch.setattr(Parts, "read_target", lambda *given: reads.append(given) or read_target(*given))
+    monkeypatch.setattr(Parts, "read_target", lambda *given, **told: reads.append(given) or read_target(*given, **told))
     monkeypatch.setattr(transfer, "_turned_round", lambda vertices, before: np.eye(3))
     sources, target = [mesh_of(1), mesh_of(3), mesh_of(4, 50)], mesh_of(2)
     frames = list(transfer.sequence(sources, target, source_axes=UPRIGHT, target_axes=UPRIGHT))

@@ -6,7 +6,7 @@ import torch
 
 from datagen.mesh.geometry import Mesh, edges_of
 from tests.support.three_networks import lively
-from training.inference.predict import surfaces_of
+from training.inference.mesh_reading import surfaces_of
 from training.networks.layers.sampling import nearness, offsets, sample
 from training.networks.layers.surface import joined, of_cells, surface_of
 from training.networks.parts import Parts
