@@ -73,6 +73,7 @@ def inside(transfer: PoseTransfer, source: Mesh, target: Mesh) -> dict[str, floa
     probe = np.repeat(source.vertices[None, :256], 24, axis=0)
     return {
         "one pair": median(lambda: transfer(source=source, target=target)),
+        "a frame of a sequence (of 20)": median(lambda: list(transfer.sequence([source] * 20, target)), 3) / 20,
         "one pair, refined": median(lambda: transfer(source=source, target=target, refine=REFINE_WEIGHT)),
         "how one mesh stands (24 ways)": median(lambda: transfer.self_errors(probe)),
     }

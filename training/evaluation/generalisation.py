@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from datagen.store import Dataset
 from training.evaluation.document import Table
-from training.evaluation.measure import LoadedMethod, normalised, transfer_each
+from training.evaluation.measure import LoadedMethod, transfer_each
 from training.evaluation.results import Score, Triple
 from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of, first_triples
 from training.evaluation.statistics import mean
+from training.inference.mesh_reading import normalised
 
 
 @dataclass(frozen=True)

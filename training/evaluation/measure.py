@@ -25,10 +25,9 @@ from datagen.store import Dataset, open_dataset
 from training.data.batch import Batch, read_batch
 from training.data.vertex_layout import read_each
 from training.evaluation.results import Dressed, Row, Score
-from training.inference.mesh_reading import boxed, posed_like, read_targets, surfaces_of, takes_surfaces
+from training.inference.mesh_reading import takes_surfaces, transferred
 from training.inference.predict import load_trained, predict
 from training.inference.projection import OntoParts
-from training.networks.parts import Parts
 from training.objectives import metrics
 from training.recipes.training import EvaluationRecipe
 
@@ -266,12 +265,6 @@ def _told_apart(titles: Sequence[str], labels: Sequence[str]) -> list[str]:
     ]
 
 
-def normalised(vertices: Vertices) -> NDArray[np.float32]:
-    """Vertices [v, 3] in the normalised box, computed in float64."""
-    exact = np.asarray(vertices, np.float64)
-    return bounding_box(exact).normalise(exact).astype(np.float32)
-
-
 @torch.no_grad()
 def transfer_each(network: nn.Module, pairs: Iterable[tuple[Mesh, Mesh]]) -> Iterator[NDArray[np.float64]]:
     """Outputs [m, 3] in the normalised box for pairs of source and target in any unit, in their order.
@@ -282,15 +275,7 @@ def transfer_each(network: nn.Module, pairs: Iterable[tuple[Mesh, Mesh]]) -> Ite
         alike, at_once = list(run), max(1, _POINTS_AT_ONCE // sum(counts))
         for start in range(0, len(alike), at_once):
             sources, targets = zip(*alike[start : start + at_once], strict=True)
-            yield from _transferred(network, sources, targets).double().numpy()
-
-
-def _transferred(network: nn.Module, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> Tensor:
-    if isinstance(network, Parts):
-        return posed_like(network, sources, read_targets(network, targets))
-    told = surfaces_of(network, sources=sources, targets=targets)
-    output: Tensor = network(source=boxed(network, sources), target=boxed(network, targets), **told)
-    return output
+            yield from transferred(network, sources, targets).double().cpu().numpy()
 
 
 def score(

@@ -149,9 +149,14 @@ class Row(Dressed, Score, Triple, Listed):
     """One method on one evaluation triple. Fields come in the order of a file's columns: the last base's first."""
 
 
+def is_dressed(row: Row) -> bool:
+    """Whether the target has garments, or was measured as one that has and came out as no number."""
+    return row.skin_millimetres != 0 or row.garment_millimetres != 0
+
+
 def write_rows(rows: list[Row], path: Path) -> None:
     """Write rows as CSV, at once; without columns of garments where nobody wears any."""
-    dressed = any(row.garment_millimetres for row in rows)
+    dressed = any(map(is_dressed, rows))
     write_csv(rows, path, Row, without=() if dressed else [field.name for field in fields(Dressed)])
 
 

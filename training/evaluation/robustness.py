@@ -17,9 +17,10 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.store import Dataset
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.document import Table
-from training.evaluation.measure import NO_OPS, POSE_TYPES, LoadedMethod, normalised, score, transfer_each
+from training.evaluation.measure import NO_OPS, POSE_TYPES, LoadedMethod, score, transfer_each
 from training.evaluation.results import Score, Triple
 from training.evaluation.statistics import mean, mean_and_interval
+from training.inference.mesh_reading import normalised
 
 NO_OP = NO_OPS[0]
 

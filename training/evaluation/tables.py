@@ -10,7 +10,7 @@ from datagen.store import Dataset
 from training.evaluation import paper_numbers as paper
 from training.evaluation.document import Line, Table, Text, cell_of, document_markdown, plain, with_best
 from training.evaluation.measure import CONTROLS, NO_OPS, POSE_TYPES, SKINNED
-from training.evaluation.results import Dressed, Row
+from training.evaluation.results import Dressed, Row, is_dressed
 from training.evaluation.statistics import BOOTSTRAP, differences, interval, spread_over, values_of
 from training.evaluation.timing import Inference
 from training.recipes.networks import DSFFNET
@@ -66,11 +66,6 @@ def columns_of(part: str) -> list[Column]:
     own = {field.name for field in fields(Dressed)}
     named = [replace(column, field=f"{part}_{column.field}") for column in COLUMNS]
     return [column for column in named if column.field in own]
-
-
-def is_dressed(row: Row) -> bool:
-    """Whether the target has garments."""
-    return row.skin_millimetres + row.garment_millimetres > 0
 
 
 def methods_of(rows: Iterable[Row]) -> list[str]:

@@ -1,8 +1,9 @@
 """What networks are given of meshes: vertices in their boxes, and what is near along surfaces, where they take that.
 
-A parts network reads meshes through a low-pass filter: vertices move twice towards the middle of those that edges join
-them with, and nearly as far away again (Taubin, "A signal processing approach to fair surface design", 1995), so that
-noise goes and limbs keep their size. What is posed are the vertices as they are.
+A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
+the edges (Taubin, "A signal processing approach to fair surface design", 1995), where it understands the mesh clearly
+better so, as one with noise. A transfer reads its meshes so, and what measures transfers of single meshes. Evaluations
+on datasets, whose bodies have no noise, do not, nor does what asks how a mesh stands, or whether it is a body.
 """
 
 from collections.abc import Sequence
@@ -20,8 +21,11 @@ from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 
 _THERE, _BACK, _TIMES = 0.5, 0.53, 2
+"""Shares of the way to the neighbours' mean and away again, and how often: noise goes, limbs keep their size."""
+_CLEARLY, _LOOKED_AT = 0.85, 256
+"""Of the misfit as the mesh is, and vertices by which it is told."""
 _NEIGHBOURS = 8
-"""Of a vertex without edges, as of points, that are taken to be near it along the surface."""
+"""Of points, that are taken to be near them along the surface."""
 
 
 def takes_surfaces(network: nn.Module) -> bool:
@@ -33,7 +37,7 @@ def surfaces_of(network: nn.Module, *, sources: Sequence[Mesh], targets: Sequenc
     """What a network takes beside the vertices of meshes: keyword arguments, none for the networks of the papers."""
     if not takes_surfaces(network):
         return {}
-    device = next(network.parameters()).device
+    device = device_of(network)
     return {
         "source_surface": surface_of_meshes(sources).to(device),
         "target_surface": surface_of_meshes(targets).to(device),
@@ -45,60 +49,104 @@ def surface_of_meshes(meshes: Sequence[Mesh]) -> Surface:
     return joined([surface_of(mesh.vertices, _edges(mesh)) for mesh in meshes])
 
 
-def boxed(network: nn.Module, meshes: Sequence[Mesh], *, as_read: bool = False) -> Tensor:
-    """Vertices [b, n, 3] of meshes of n vertices each in their normalised boxes, where the network is.
+def has_points(mesh: Mesh) -> bool:
+    """Whether some vertices have no face, so that what is near them is told by where they are."""
+    return not _in_faces(mesh).all()
 
-    ``as_read``: through the low-pass filter, in the boxes of the meshes as they are.
-    """
-    boxes = [bounding_box(mesh.vertices) for mesh in meshes]
-    vertices = [smoothed(mesh) if as_read else mesh.vertices for mesh in meshes]
-    stacked = np.stack([box.normalise(each).astype(np.float32) for box, each in zip(boxes, vertices, strict=True)])
-    return torch.from_numpy(stacked).to(next(network.parameters()).device)
+
+def device_of(network: nn.Module) -> torch.device:
+    """Where a network's weights are."""
+    return next((weight.device for weight in network.parameters()), torch.device("cpu"))
+
+
+def normalised(vertices: Floats) -> NDArray[np.float32]:
+    """Vertices [n, 3] in their normalised box, which is computed in float64."""
+    exact = np.asarray(vertices, np.float64)
+    return bounding_box(exact).normalise(exact).astype(np.float32)
+
+
+def stacked(network: nn.Module, meshes: Sequence[Floats]) -> Tensor:
+    """Vertices [n, 3] of some meshes, each in its normalised box, as a batch [b, n, 3] where the network is."""
+    return torch.from_numpy(np.stack([normalised(vertices) for vertices in meshes])).to(device_of(network))
+
+
+def transferred(network: nn.Module, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> Tensor:
+    """Return targets of n vertices each [b, n, 3] in the poses of sources of m vertices each, in boxes of their own."""
+    if isinstance(network, Parts):
+        return posed_targets(network, sources, read_targets(network, targets))
+    inputs = {name: stacked(network, [mesh.vertices for mesh in meshes])
+              for name, meshes in (("source", sources), ("target", targets))}  # fmt: skip
+    output: Tensor = network(**inputs, **surfaces_of(network, sources=sources, targets=targets))
+    return output
 
 
 @torch.no_grad()
 def read_targets(network: Parts, targets: Sequence[Mesh]) -> ReadTarget:
-    """Return targets of as many vertices each as a parts network reads them."""
-    surface = surface_of_meshes(targets).to(next(network.parameters()).device)
-    return network.read_target(boxed(network, targets), surface, as_read=boxed(network, targets, as_read=True))
+    """Return what a parts network reads off targets of as many vertices each."""
+    boxes = [bounding_box(np.asarray(mesh.vertices, np.float64)) for mesh in targets]
+    read = [box.normalise(_as_read(network, mesh)).astype(np.float32) for box, mesh in zip(boxes, targets, strict=True)]
+    device = device_of(network)
+    return network.read_target(
+        stacked(network, [mesh.vertices for mesh in targets]),
+        surface_of_meshes(targets).to(device),
+        as_read=torch.from_numpy(np.stack(read)).to(device),
+    )
 
 
 @torch.no_grad()
-def posed_like(network: Parts, sources: Sequence[Mesh], targets: ReadTarget, surface: Surface | None = None) -> Tensor:
-    """Return targets [b, n, 3] in boxes of their own, in the poses of sources of as many vertices each.
+def posed_targets(
+    network: Parts, sources: Sequence[Mesh], targets: ReadTarget, surface: Surface | None = None
+) -> Tensor:
+    """Return targets [b, n, 3] that were read, in the poses of as many sources, in boxes of their own.
 
     ``surface``: of the sources, where it is known.
     """
-    read = [Mesh(smoothed(mesh), mesh.faces) for mesh in sources]
-    surface = surface or surface_of_meshes(sources).to(targets.vertices.device)
-    return network.posed_target(boxed(network, read), targets, surface)
+    surface = surface or surface_of_meshes(sources).to(device_of(network))
+    read = stacked(network, [_as_read(network, mesh) for mesh in sources])
+    return network.posed_target(read, targets, surface)
 
 
-def smoothed(mesh: Mesh) -> NDArray[np.float64]:
+def _as_read(network: Parts, mesh: Mesh) -> Floats:
+    """The vertices [n, 3] of a mesh as they are, or where the low-pass filter leaves them."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    if not len(mesh.faces):
+        return vertices
+    filtered = low_passed(mesh)
+    some = np.random.default_rng(0).permutation(len(vertices))[:_LOOKED_AT]
+    looked_at = stacked(network, [vertices, filtered])[:, some]
+    misfits = network.understood(looked_at)[0]
+    return filtered if bool(misfits[1] < _CLEARLY * misfits[0]) else vertices
+
+
+def low_passed(mesh: Mesh) -> NDArray[np.float64]:
     """Vertices [n, 3] of a mesh without what changes from each to the next; those on open borders stay."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     count = len(vertices)
     ahead = csr_array((np.ones(3 * len(faces)), (faces.T.ravel(), np.roll(faces, -1, 1).T.ravel())), (count, count))
     sides = (ahead + ahead.T).tocsr()  # how many faces each edge has
-    row = np.repeat(np.arange(count), np.diff(sides.indptr))
-    free = (np.bincount(row, sides.data == 1, count) == 0) & (np.diff(sides.indptr) > 0)
-    mean = csr_array((1 / np.diff(sides.indptr)[row], sides.indices, sides.indptr), (count, count))
+    neighbours = np.diff(sides.indptr)
+    row = np.repeat(np.arange(count), neighbours)
+    free = ((np.bincount(row, sides.data == 1, count) == 0) & (neighbours > 0))[:, None]
+    mean = csr_array((1 / neighbours[row], sides.indices, sides.indptr), (count, count))
     for _ in range(_TIMES):
         for share in (_THERE, -_BACK):
-            vertices = vertices + np.where(free[:, None], share * (mean @ vertices - vertices), 0)
+            vertices = vertices + np.where(free, share * (mean @ vertices - vertices), 0)
     return vertices
 
 
+def _in_faces(mesh: Mesh) -> NDArray[np.bool_]:
+    """Whether each vertex [n] has a face."""
+    found = np.zeros(len(mesh.vertices), np.bool_)
+    found[np.asarray(mesh.faces)] = True
+    return found
+
+
 def _edges(mesh: Mesh) -> NDArray[np.int64]:
-    """Edges [e, 2] of a mesh; vertices without any have some to those that are nearest."""
-    edges = edges_of(mesh.faces)
-    alone = np.setdiff1d(np.arange(len(mesh.vertices)), edges)
-    if not len(alone):
+    """Edges [e, 2] of a mesh; its points have some to the points that are nearest, none to vertices of faces."""
+    edges, vertices = edges_of(mesh.faces), np.asarray(mesh.vertices, np.float64)
+    points = np.flatnonzero(~_in_faces(mesh) & np.isfinite(vertices).all(axis=1))
+    if len(points) < 2:
         return edges
-    return np.concatenate([edges, _to_nearest(mesh.vertices, alone)])
-
-
-def _to_nearest(vertices: Floats, some: NDArray[np.int64]) -> NDArray[np.int64]:
-    nearest = cKDTree(vertices).query(vertices[some], min(_NEIGHBOURS + 1, len(vertices)))[1].reshape(len(some), -1)
-    edges = np.stack([np.repeat(some, nearest.shape[1]), nearest.ravel()], axis=1)
-    return np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+    nearest = cKDTree(vertices[points]).query(vertices[points], min(_NEIGHBOURS + 1, len(points)))[1]
+    between = np.stack([np.repeat(points, nearest.shape[1]), points[nearest.ravel()]], axis=1)
+    return np.concatenate([edges, between])

@@ -15,11 +15,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
-from training.inference.mesh_reading import posed_like, read_targets, surface_of_meshes, takes_surfaces
+from training.inference.mesh_reading import (
+    device_of,
+    has_points,
+    posed_targets,
+    read_targets,
+    stacked,
+    surface_of_meshes,
+    surfaces_of,
+)
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
 from training.inference.projection import OntoParts
@@ -57,7 +65,7 @@ class PoseTransfer:
         if isinstance(network, OntoParts):
             self._bare, self._parts = GraphedTransfer(network.network), network.parts
         self._network = network
-        self._device = next((weight.device for weight in network.parameters()), torch.device("cpu"))
+        self._device = device_of(network)
 
     @classmethod
     def from_run(
@@ -167,7 +175,8 @@ class PoseTransfer:
 
         ``surfaces`` are what :func:`training.inference.mesh_reading.surfaces_of` says of the meshes.
         """
-        output = self._transfer(source=self._boxed(source), target=self._boxed(target), **surfaces)
+        meshes = (stacked(self._network, [mesh]) for mesh in (source, target))
+        output = self._transfer(source=next(meshes), target=next(meshes), **surfaces)
         return output[0].double().cpu().numpy()
 
     def _poser(self, target: Mesh) -> Callable[[Mesh], NDArray[np.float64]]:
@@ -176,26 +185,23 @@ class PoseTransfer:
         What is read of the target alone, and what is near along the surface of sources that list the same faces, is
         found once.
         """
-        network, first, of_source = self._network, None, None
+        network = self._network
+        if not isinstance(network, Parts):
+            told = surfaces_of(network, sources=[target], targets=[target])
+            return lambda source: self.vertices(source.vertices, target.vertices, **told)
         with products("float32"):
-            read = read_targets(network, [target]) if isinstance(network, Parts) else None
-        of_target = surface_of_meshes([target]).to(self._device) if takes_surfaces(network) and read is None else None
+            read = read_targets(network, [target])
+        first: Mesh | None = None
+        surface: Surface | None = None
 
         def posed(source: Mesh) -> NDArray[np.float64]:
-            nonlocal of_source, first
-            if takes_surfaces(network) and (first is None or not _is_same_mesh(source, first)):
-                of_source, first = surface_of_meshes([source]).to(self._device), source
-            if isinstance(network, Parts) and read:
-                with products("float32"):
-                    return posed_like(network, [source], read, of_source)[0].double().cpu().numpy()
-            told = {"source_surface": of_source, "target_surface": of_target} if of_source and of_target else {}
-            return self.vertices(source.vertices, target.vertices, **told)
+            nonlocal first, surface
+            if first is None or not _is_same_mesh(source, first):
+                first, surface = source, surface_of_meshes([source]).to(self._device)
+            with products("float32"):
+                return posed_targets(network, [source], read, surface)[0].double().cpu().numpy()
 
         return posed
-
-    def _boxed(self, vertices: Floats) -> Tensor:
-        """Vertices [1, n, 3] in their normalised box, where the network is."""
-        return torch.from_numpy(bounding_box(vertices).normalise(vertices).astype(np.float32)[None]).to(self._device)
 
     @torch.no_grad()
     def self_errors(self, meshes: Floats) -> NDArray[np.float64]:
@@ -254,7 +260,8 @@ class PoseTransfer:
 
 
 def _is_same_mesh(one: Mesh, other: Mesh) -> bool:
-    return len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
+    alike = len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
+    return alike and not has_points(one)
 
 
 @dataclass(frozen=True)

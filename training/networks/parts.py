@@ -57,23 +57,26 @@ class Reading(NamedTuple):
 
 
 class ReadTarget(NamedTuple):
-    """A target as it was read (:meth:`Parts.read_target`).
+    """What was read off targets (:meth:`Parts.read_target`).
 
     Attributes
     ----------
     vertices, as_read
-        [b, n, 3], what is posed and what was read.
+        [b, n, 3], what is posed, and where it was read.
     drawn
         The sample of what was read.
     weights
         By which vertices are posed [b, n, part].
+    rotations, joints
+        As in :class:`Reading`.
     """
 
     vertices: Tensor
     as_read: Tensor
     drawn: Sample
     weights: Tensor
-    reading: Reading
+    rotations: Tensor
+    joints: Tensor
 
 
 class Parts(nn.Module):
@@ -151,7 +154,7 @@ class Parts(nn.Module):
         source, target
             In the normalised box of each mesh.
         source_surface, target_surface
-            What is near along their surfaces; None where that is not known, as of points: what touches is near then.
+            What is near along their surfaces; None where that is not known: what touches is near then.
 
         Raises
         ------
@@ -173,13 +176,15 @@ class Parts(nn.Module):
         ``as_read``: where their vertices are to be read, without noise, say; by default where they are.
         """
         read = target if as_read is None else as_read
+        check_pair(target, read, self.lift.weight.dtype)
         with full_precision(target):
             drawn = sample(read, surface)
-            reading = self.read(read, drawn)
-            return ReadTarget(target, read, drawn, reading.logits.softmax(2), reading)
+            logits, _, rotations, joints = self.read(read, drawn)
+            return ReadTarget(target, read, drawn, logits.softmax(2), rotations, joints)
 
     def posed_target(self, source: Tensor, target: ReadTarget, surface: Surface | None = None) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before."""
+        check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
             return self._corrected(sample(source, surface), target)
 
@@ -253,18 +258,21 @@ class Parts(nn.Module):
 
     def _corrected(self, source: Sample, target: ReadTarget) -> Tensor:
         wanted = self.read(source.vertices, source).rotations
-        vertices, as_read, drawn, weights, own = target
-        turns = wanted @ own.rotations.mT
+        vertices, as_read, drawn, weights, own, joints = target
+        turns = wanted @ own.mT
 
-        def read_again(turns: Tensor) -> tuple[Tensor, Tensor]:
-            posed = self.posed(as_read, weights, own.joints, turns)
-            found = self._read_again(taken(posed, drawn.rows), drawn).rotations
-            return found, (wanted - found).square().sum((1, 2, 3))
+        def posed(turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            output = self.posed(as_read, weights, joints, turns)
+            found = self._read_again(taken(output, drawn.rows), drawn).rotations
+            return output, found, (wanted - found).square().sum((1, 2, 3))
 
-        found, missing = read_again(turns)
+        output, found, missing = posed(turns)
         corrected = wanted @ found.mT @ turns
-        is_better = read_again(corrected)[1] <= missing
-        return self.posed(vertices, weights, own.joints, torch.where(is_better[:, None, None, None], corrected, turns))
+        better, _, left = posed(corrected)
+        is_better = left <= missing
+        if as_read is vertices:
+            return torch.where(is_better[:, None, None], better, output)
+        return self.posed(vertices, weights, joints, torch.where(is_better[:, None, None, None], corrected, turns))
 
     def _read_again(self, moved: Tensor, drawn: Sample) -> Reading:
         """Return what is read off the sample's vertices [b, k, 3] where they came to lie."""

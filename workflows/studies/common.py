@@ -25,6 +25,8 @@ from workflows.pipeline.stage import recorded
 from workflows.pipeline.weights_argument import Evaluated, evaluated
 
 _SETTINGS = "settings.json"
+_MEASURED_AS = 2
+"""Raise this when meshes are read, or measured, otherwise, so that rows of an earlier version are measured again."""
 _SAVE_EVERY = 5.0  # seconds
 
 
@@ -91,7 +93,7 @@ def about_weights(weights: Sequence[Evaluated]) -> list[str]:
 
 def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
     """Whether a folder's rows were measured with these settings; from now on the folder's rows are."""
-    text = json.dumps(settings, indent=1, sort_keys=True).encode()
+    text = json.dumps({"measured_as": _MEASURED_AS, **settings}, indent=1, sort_keys=True).encode()
     try:
         same = read_within(folder, _SETTINGS) == text
     except (FileNotFoundError, UnsafeFileError):

@@ -5,7 +5,7 @@ import pytest
 
 from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, edges_of
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
-from training.evaluation.measure import normalised
+from training.inference.mesh_reading import normalised
 
 BY_NAME = {its.name: its for its in DISTURBANCES}
 every = pytest.mark.parametrize("disturbance", DISTURBANCES, ids=lambda its: its.name)

@@ -12,9 +12,10 @@ from datagen.store import Dataset
 from tests.datagen.bodies.clothed.test_clothed_dataset import recipe
 from training.evaluation.document import cell_of
 from training.evaluation.evaluate import evaluate
-from training.evaluation.measure import NO_OPS, SKINNED, normalised, score
+from training.evaluation.measure import NO_OPS, SKINNED, score
 from training.evaluation.results import Row, read_rows, write_rows
 from training.evaluation.tables import PARTS, by_part, columns_of, emphasised, results, summary
+from training.inference.mesh_reading import normalised
 from training.recipes.training import EvaluationRecipe
 
 

@@ -2,11 +2,19 @@
 
 import numpy as np
 import pytest
+import torch
 
 from datagen.mesh.geometry import Mesh
 from tests.support.shapes.avatars import sphere
 from tests.support.three_networks import lively
-from training.inference.mesh_reading import boxed, posed_like, read_targets, smoothed, surface_of_meshes
+from training.inference.mesh_reading import (
+    low_passed,
+    posed_targets,
+    read_targets,
+    stacked,
+    surface_of_meshes,
+    transferred,
+)
 
 NO_FACES = np.zeros((0, 3), np.int64)
 
@@ -22,37 +30,83 @@ def off(vertices: np.ndarray) -> float:
 
 def test_noise_goes_and_size_stays() -> None:
     ball = sphere(radius=0.5, subdivisions=3)
-    assert off(smoothed(noisy(ball, 0.02))) < 0.65 * off(noisy(ball, 0.02).vertices)
-    assert off(smoothed(ball)) < 0.002
+    assert off(low_passed(noisy(ball, 0.02))) < 0.65 * off(noisy(ball, 0.02).vertices)
+    assert off(low_passed(ball)) < 0.002
 
 
 def test_open_borders_and_vertices_without_faces_stay() -> None:
     ball = sphere(radius=0.5, subdivisions=3)
     half = noisy(Mesh(np.concatenate([ball.vertices, [[0, 2.0, 0]]]), ball.faces[: len(ball.faces) // 2]), 0.02)
     sides, counts = np.unique(np.sort(half.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
-    border, moved = np.unique(sides[counts == 1]), np.any(smoothed(half) != half.vertices, axis=1)
+    border, moved = np.unique(sides[counts == 1]), np.any(low_passed(half) != half.vertices, axis=1)
     within = np.setdiff1d(np.unique(half.faces), border)
     assert len(border) and len(within)
     assert moved[within].all() and not np.delete(moved, within).any()
-    assert np.array_equal(smoothed(Mesh(ball.vertices, NO_FACES)), ball.vertices)
+    assert np.array_equal(low_passed(Mesh(ball.vertices, NO_FACES)), ball.vertices)
 
 
 def test_the_order_of_vertices_and_faces_does_not_matter() -> None:
     ball, random = noisy(sphere(subdivisions=2), 0.02), np.random.default_rng(1)
     order = random.permutation(len(ball.vertices))
     renamed = Mesh(ball.vertices[order], random.permutation(np.argsort(order)[ball.faces][:, [1, 2, 0]]))
-    np.testing.assert_allclose(smoothed(renamed), smoothed(ball)[order], atol=1e-12)
+    np.testing.assert_allclose(low_passed(renamed), low_passed(ball)[order], atol=1e-12)
 
 
-def test_what_is_posed_are_the_vertices_as_they_are() -> None:
+@pytest.mark.parametrize("better", [True, False])
+def test_a_mesh_is_read_filtered_where_it_is_understood_better_so_and_posed_as_it_is(
+    better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     network, ball = lively("parts").eval(), noisy(sphere(subdivisions=3), 0.02)
+    misfits = torch.tensor([1.0, 0.8 if better else 0.9])
+    monkeypatch.setattr(network, "understood", lambda meshes: (misfits, None))
     read = read_targets(network, [ball])
-    assert np.array_equal(read.vertices.numpy(), boxed(network, [ball]).numpy())
-    assert np.array_equal(read.as_read.numpy(), boxed(network, [ball], as_read=True).numpy())
-    assert not np.array_equal(read.as_read.numpy(), read.vertices.numpy())
-    rough = posed_like(network, [ball], read)[0].numpy()
-    even = posed_like(network, [ball], read._replace(vertices=read.as_read))[0].numpy()
-    assert np.abs(rough - even).mean() > 0.3 * (read.vertices - read.as_read).abs().mean().item()
+    assert torch.equal(read.vertices, stacked(network, [ball.vertices]))
+    assert torch.equal(read.as_read, read.vertices) != better
+    rough = posed_targets(network, [ball], read)[0]
+    even = posed_targets(network, [ball], read._replace(vertices=read.as_read))[0]
+    moved = (read.vertices - read.as_read).abs().mean()
+    assert (rough - even).abs().mean() >= 0.3 * moved and (moved > 0) == better
+
+
+def test_what_is_filtered_and_posed_does_not_depend_on_what_else_is_in_a_batch() -> None:
+    network, meshes = lively("parts").eval(), [noisy(sphere(subdivisions=2), spread) for spread in (0.0, 0.05)]
+    together = transferred(network, meshes, meshes[::-1])
+    for place, (source, target) in enumerate(zip(meshes, meshes[::-1], strict=True)):
+        alone = transferred(network, [source], [target])[0]
+        torch.testing.assert_close(together[place], alone, atol=1e-5, rtol=1e-4)
+
+
+def test_a_mesh_that_is_broken_breaks_no_other() -> None:
+    network, ball = lively("parts").eval(), sphere(subdivisions=2)
+    points = Mesh(ball.vertices, NO_FACES)
+    broken = Mesh(np.where(np.arange(len(ball.vertices))[:, None] == 3, np.nan, ball.vertices), NO_FACES)
+    output = transferred(network, [points, broken], [points, points])
+    assert output[0].isfinite().all() and output[1].isnan().all()
+
+
+def test_networks_without_weights_are_called_on_the_cpu() -> None:
+    class Copier(torch.nn.Module):
+        def forward(self, *, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+            return source
+
+    ball = sphere(subdivisions=1)
+    assert torch.equal(transferred(Copier(), [ball], [ball]), stacked(Copier(), [ball.vertices]))
+
+
+def test_points_do_not_join_what_faces_keep_apart() -> None:
+    """Two sheets that touch, and a stray vertex between them."""
+    x, z = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 0.5, 11), indexing="ij"))
+    low = np.stack([x, 0 * x, z], axis=1)
+    corner = (np.arange(20)[:, None] * 11 + np.arange(10)).ravel()
+    sheet = np.concatenate([corner[:, None] + [0, 1, 11], corner[:, None] + [1, 12, 11]])
+    seam = [[0 + 220, 231 + 220, 221]]  # joined at one end alone
+    folded = np.concatenate([sheet, sheet + 231, seam])
+    both = np.concatenate([low, low + np.array([0, 0.02, 0])])
+    stray = np.concatenate([both, [[0.2, 0.01, 0.25]]])
+    for vertices in (both, stray):
+        found = surface_of_meshes([Mesh(vertices, folded)])
+        one, other = (int(found.cells[0, np.abs(vertices - [0.2, y, 0.25]).sum(1).argmin()]) for y in (0, 0.02))
+        assert one != other and not found.near[0, one, other]
 
 
 @pytest.mark.parametrize("pieces", [1, 2])

@@ -12,6 +12,7 @@ from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PoseRecipe
+from training.inference.mesh_reading import surfaces_of
 from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import PoseTransfer
 from training.networks.layers.sampling import sample
@@ -121,7 +122,11 @@ def test_noise_of_a_source_is_mostly_filtered(human: PoseTransfer) -> None:
     faces, random = case.target.faces, np.random.default_rng(0)
     rough = [Mesh(each + random.normal(0, 0.017, each.shape), faces) for each in case.sources[1:]]
     error = pmd(np.stack([human.unplaced(mesh, case.target) for mesh in rough]), case.truths[1:])
-    unfiltered = pmd(np.stack([human.vertices(mesh.vertices, case.target.vertices) for mesh in rough]), case.truths[1:])
+    known = [surfaces_of(human._network, sources=[mesh], targets=[case.target]) for mesh in rough]
+    read = [
+        human.vertices(mesh.vertices, case.target.vertices, **told) for mesh, told in zip(rough, known, strict=True)
+    ]
+    unfiltered = pmd(np.stack(read), case.truths[1:])
     assert error < 0.9 * unfiltered and error < 0.0003
 
 

@@ -70,6 +70,16 @@ def test_a_target_is_read_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -
         np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-6)  # the way through space
 
 
+def test_what_is_near_among_points_is_found_for_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Faces of the first vertex alone: all others are points, of other places in each frame."""
+    transfer, random = PoseTransfer(lively("parts")), np.random.default_rng(0)
+    monkeypatch.setattr(transfer, "_turned_round", lambda vertices, before: np.eye(3))
+    clouds = [Mesh(random.normal(size=(300, 3)) * (0.1, 1, 0.1), np.zeros((1, 3), np.int64)) for _ in range(2)]
+    frames = list(transfer.sequence(clouds, mesh_of(2), source_axes=UPRIGHT, target_axes=UPRIGHT))
+    moved = frames[1].vertices - placed(mesh_of(2), transfer.unplaced(clouds[1], mesh_of(2)))
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-6)
+
+
 def test_the_output_stands_on_the_ground_of_the_target() -> None:
     target = Mesh(np.array([[5.0, 3, 1], [6, 3, 1], [5, 5, 1], [6, 5, 1], [5, 5, 2]]), FACES)
     sitting = Mesh(target.vertices * (1, 0.4, 1), FACES)

@@ -97,7 +97,7 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     vertices
         [n, 3] in any unit.
     edges
-        [e, 2]; of points none, and all is near all.
+        [e, 2]; without any all is near all.
     """
     vertices = np.asarray(vertices, np.float64)
     _, first, point_of = np.unique(vertices @ _ELSEWHERE, return_index=True, return_inverse=True)
