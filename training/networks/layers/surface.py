@@ -101,7 +101,7 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     """
     vertices = np.asarray(vertices, np.float64)
     _, first, point_of = np.unique(vertices @ _ELSEWHERE, return_index=True, return_inverse=True)
-    placed, count = bounding_box(vertices).normalise(vertices[first]), len(first)
+    placed, count = np.nan_to_num(bounding_box(vertices).normalise(vertices[first])), len(first)
     edges = point_of[edges]
     piece = _joined_by(edges, count)
     is_crumb = (np.bincount(piece) < _CRUMB * count)[piece]
