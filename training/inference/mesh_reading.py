@@ -3,7 +3,8 @@
 A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
 the edges (Taubin, "A signal processing approach to fair surface design", 1995), where it understands the mesh clearly
 better so, as one with noise. A transfer reads its meshes so, and what measures transfers of single meshes. Evaluations
-on datasets, whose bodies have no noise, do not, nor does what asks how a mesh stands, or whether it is a body.
+on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body, in which
+pose an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence

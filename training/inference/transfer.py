@@ -26,7 +26,7 @@ from training.inference.mesh_reading import (
     read_targets,
     stacked,
     surface_of_meshes,
-    surfaces_of,
+    takes_surfaces,
 )
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
@@ -186,8 +186,8 @@ class PoseTransfer:
         found once.
         """
         network = self._network
-        if not isinstance(network, Parts):
-            told = surfaces_of(network, sources=[target], targets=[target])
+        if not isinstance(network, Parts):  # one whose outputs are projected reads the target's surface alone
+            told = {"target_surface": surface_of_meshes([target]).to(self._device)} if takes_surfaces(network) else {}
             return lambda source: self.vertices(source.vertices, target.vertices, **told)
         with products("float32"):
             read = read_targets(network, [target])
