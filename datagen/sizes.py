@@ -10,6 +10,7 @@ from pathlib import Path
 
 from datagen.bodies import load_body
 from datagen.common.errors import DsffnetError, RecipeError, StorageError
+from datagen.common.files import files_below
 from datagen.common.resources import bytes_text, free_disk, free_memory
 from datagen.common.seeding import Stream, generator
 from datagen.grid import SPLITS, Grid
@@ -98,7 +99,7 @@ def require_disk(size: DatasetSize, url: str) -> None:
         It has not.
     """
     folder = Path(url)
-    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    there = sum(file.stat().st_size for file in files_below(folder))
     free = free_disk(folder)
     if size.disk - there > free:
         raise StorageError(

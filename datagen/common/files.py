@@ -57,6 +57,19 @@ def resolve_within(folder: Path, name: str) -> Path:
     return path
 
 
+def files_below(folder: Path | str) -> Iterator["os.DirEntry[str]"]:
+    """Every file below a folder, links to files among them, in no order; no link to a folder is followed.
+
+    What is not there, or may not be looked into, holds none.
+    """
+    with suppress(FileNotFoundError, NotADirectoryError, PermissionError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                yield from files_below(entry.path)
+            elif entry.is_file():
+                yield entry
+
+
 def refuse_links_out(folder: Path, *, but: tuple[str, ...] = ()) -> None:
     """Raise if something directly in a folder, which need not exist, is a link that leads out of it.
 

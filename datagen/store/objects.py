@@ -7,6 +7,7 @@ regular files only.
 
 import os
 import stat
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ from zarr.core.sync import sync
 from zarr.storage import LocalStore
 
 from datagen.common.errors import DatasetError, UnsafeFileError
-from datagen.common.files import open_regular, read_bounded, resolve_within
+from datagen.common.files import files_below, open_regular, read_bounded, resolve_within
 from datagen.store.object_names import is_leftover, is_member, limit_of, require_member, require_short
 from datagen.store.remote_objects import S3_OPTIONS, RemoteObjects
 
@@ -62,6 +63,10 @@ class LocalObjects(LocalStore):
     def names(self) -> list[str]:
         """Names of what lies directly in the folder."""
         return sorted(os.listdir(self.root)) if self.root.is_dir() else []
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        for file in files_below(self.root / prefix):  # Zarr's own way takes ten times as long
+            yield file.path.removeprefix(f"{self.root}/")
 
     def _place(self, path: str) -> Path:
         """Where an object is to be written or removed; a link there is replaced or removed itself, never followed.
