@@ -153,13 +153,18 @@ def _print_fold_over(name: str, body: CanonicalBody, found: SkinningField, trans
 
 
 def roots(poses: int) -> None:
-    """Roots of body and skinned garments in NPT's poses: whether found, and whether where a point comes from."""
+    """Roots of body and skinned garments in NPT's poses: whether found, and whether where a point comes from.
+
+    Of the body, of its vertices and of its surface: vertices lie close at toes and in the face.
+    """
     subject, drawn = Subject("skirt", "skinned"), draw_poses(PoseRecipe(), range(poses))
     body, transforms = subject.body, _transforms(subject.body, drawn)
     weights, bones = diffused_skinning(body), starting_bones(body)
     print("starts from", ", ".join(body.names[bone] for bone in bones))
     seen = Solid(body.vertices, body.faces).seen(body.vertices, vertex_normals(body.vertices, body.faces))
     shown = torch.from_numpy(seen & ~_hands(body))
+    areas = _areas(body)[shown]
+    areas /= areas.sum()
     by_own = skinned(body.vertices, body.weights, transforms.numpy())
     canonical, garments = torch.from_numpy(body.vertices).float(), _own_canonical(subject)
     for number, scan in enumerate(subject.scans(drawn)):
@@ -168,8 +173,9 @@ def roots(poses: int) -> None:
             with timed(f"pose {number}, body {what}"):
                 found = canonical_roots(moved, torch.from_numpy(places).float(), transforms[number], bones)
             away = _away(found, canonical)[shown]
-            a_root = found.valid.any(dim=1)[shown].float().mean()
-            print(f"  a root {a_root:.2%}, true place within 1 cm {(away < 0.01).float().mean():.2%}")
+            a_root, true = found.valid.any(dim=1)[shown], away < 0.01
+            for of, share in (("vertices", torch.full_like(areas, 1 / len(areas))), ("the surface", areas)):
+                print(f"  of {of}: a root {share[a_root].sum():.2%}, true place within 1 cm {share[true].sum():.2%}")
         for part, mesh in zip(("shirt", "skirt"), scan[1:], strict=True):
             used = np.unique(mesh.faces)
             found = canonical_roots(moved, torch.from_numpy(mesh.vertices[used]).float(), transforms[number], bones)
@@ -177,6 +183,13 @@ def roots(poses: int) -> None:
             a_root = found.valid.any(dim=1).float().mean()
             spread = f"{away.median():.1f} mm (median), {away.quantile(0.9):.1f} mm (90 %)"
             print(f"  {part}: a root {a_root:.2%}, canonical place within {spread}")
+
+
+def _areas(body: CanonicalBody) -> Tensor:
+    """The area [n] around each vertex of a body, a third of its triangles'."""
+    corners = body.vertices[body.faces]
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return torch.from_numpy(np.bincount(body.faces.ravel(), np.repeat(doubled / 6, 3), len(body.vertices)))
 
 
 def _away(found: Roots, canonical: Tensor) -> Tensor:
