@@ -22,7 +22,7 @@ from datagen.mesh.geometry import edges_of
 from datagen.recipe import DrapeSolver
 
 _REACH, _FAR = 0.1, 1.0  # metres within which the body is looked for: at each station, and once
-_FALL, _FALL_LAST = 5.0, 1.0
+_FALL, _FALL_LAST = 5.0, 2.5
 """Metres a second squared at the stations, and at the end of settling.
 
 Not 9.81, as few steps do not carry the weight of fine cloth: it would hang stretched. Against so little, bending counts

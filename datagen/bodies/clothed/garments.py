@@ -22,7 +22,7 @@ from datagen.recipe import GarmentPart
 _STATURE = 1.7  # metres; ease is meant for a person of this height, and less for a smaller one
 _LAYER, _NEAREST = 0.003, 0.004  # metres: how far each part stays off the one below it, the first off the body
 _RING, _LEVEL = 0.03, 1e-6  # metres: how high the top of an open skirt is; what counts as cut there
-_BENDING = {"soft": 0.15, "normal": 0.25, "stiff": 0.6}  # of what opposite vertices are off, undone by a step
+_BENDING = {"soft": 0.5, "normal": 0.7, "stiff": 0.95}  # of what opposite vertices are off, undone by a step
 _ROOM = 1.3
 _COVER_FROM_HEM = 0.08  # metres, for a person of 1.7 m; nearer to a hem the skin is kept, as garments ride up
 _GRID = 2.0**20

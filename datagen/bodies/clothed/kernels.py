@@ -197,9 +197,9 @@ def take_steps(
             if state.inverse_mass[vertex] > 0.0:
                 state.velocity[vertex] = _KEPT * state.velocity[vertex] + fall
                 state.place[vertex] = state.place[vertex] + STEP * state.velocity[vertex]
-        for _pass in range(_PASSES):
-            _project(edges, state)
         _project(bends, state)
+        for _pass in range(_PASSES):  # last, so that cloth that bends stiffly is not stretched by it
+            _project(edges, state)
         _hold(state)
         for vertex in range(state.place.shape[0]):
             place = state.place[vertex]

@@ -21,7 +21,7 @@ from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
 
-DRAPING = Asset("outfits and draping", "Apache-2.0", "6")
+DRAPING = Asset("outfits and draping", "Apache-2.0", "7")
 """To get another version with any change of outfits, cuts or draping that changes bytes: data must not mix."""
 _GRID = 2.0**20
 
