@@ -195,7 +195,7 @@ def _measured(model: ClothedModel, fine: ClothedModel, outfit: int, identities: 
         found["vertices"].append(draped.shape[1])
         found["inside"] += [np.mean(depths(*pair, body_faces()) > 0.002) for pair in zip(draped, body, strict=True)]
         found["stretch"] += [_lengths(one, edges) / person.garment.lengths(edges) for one in draped]
-        found["skinned"].append(_apart(draped, skin(person.garment.rest, world)))
+        found["skinned"].append(_apart(draped[:2], skin(person.garment.rest, world[:2])))
         found["finer"].append(_apart(draped[:2], fine.vertices(parameters, poses[:2])[:, first:]))
     stretch = np.percentile(np.concatenate(found["stretch"]), [50, 99])
     return [

@@ -66,7 +66,7 @@ def files_below(folder: Path | str) -> Iterator["os.DirEntry[str]"]:
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
                 yield from files_below(entry.path)
-            elif entry.is_file():
+            elif entry.is_file(follow_symlinks=False) or (entry.is_symlink() and os.path.isfile(entry.path)):
                 yield entry
 
 

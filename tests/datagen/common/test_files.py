@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from datagen.common.errors import UnsafeFileError
-from datagen.common.files import lock_within, read_bounded, refuse_links_out, resolve_within
+from datagen.common.files import files_below, lock_within, read_bounded, refuse_links_out, resolve_within
 
 
 @pytest.mark.parametrize("name", ["", ".", "/etc/hostname", "../secret", "a/../../secret", "a\0b", "..\\secret"])
@@ -32,6 +32,19 @@ def test_links_out_of_a_folder_are_refused_with_what_else_to_do_but_for_those_th
     refuse_links_out(tmp_path / "folder", but=("x",))
     with pytest.raises(UnsafeFileError, match=rf"link the whole folder {tmp_path}/folder instead .*; else remove it"):
         refuse_links_out(tmp_path / "folder", but=("y",))
+
+
+def test_files_below_a_folder_are_all_found_whatever_else_lies_there(tmp_path: Path) -> None:
+    (tmp_path / "folder" / "below").mkdir(parents=True)
+    for name in ("a", "b", "below/c"):
+        (tmp_path / "folder" / name).write_text(name)
+    os.mkfifo(tmp_path / "folder" / "pipe")
+    links = {"to-file": "a", "to-folder": tmp_path, "to-itself": "to-itself", "to-nothing": "none", "through": "a/x"}
+    for name, leads_to in links.items():
+        (tmp_path / "folder" / name).symlink_to(leads_to)
+    found = {os.path.relpath(file.path, tmp_path / "folder") for file in files_below(tmp_path / "folder")}
+    assert found == {"a", "b", "below/c", "to-file"}
+    assert not list(files_below(tmp_path / "none")) and not list(files_below(tmp_path / "folder" / "a"))
 
 
 def test_a_link_that_leads_to_itself_is_refused(tmp_path: Path) -> None:
