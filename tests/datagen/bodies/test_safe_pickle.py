@@ -308,7 +308,7 @@ def test_few_bytes_that_stand_for_many_are_refused_at_once(kind: str) -> None:
     started = time.perf_counter()
     with pytest.raises(BodyError, match=r"'x' in model\.pkl is not an array of numbers: (it takes .* GiB|the rows)"):
         array(content)
-    assert time.perf_counter() - started < 20
+    assert time.perf_counter() - started < 5
 
 
 def test_what_is_named_often_is_worked_out_once() -> None:
