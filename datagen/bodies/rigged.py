@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies.proportions import Scales, Stretchable
-from datagen.bodies.skinning import Rest, rig_of, skin
+from datagen.bodies.skinning import Rest, kept, rig_of, skin
 from datagen.characters.character import load_characters, shared_joints
 from datagen.characters.weld import volume
 from datagen.common.errors import BodyError
@@ -41,6 +41,7 @@ class RiggedModel:
         self.joints = shared_joints(self._characters)[0]
         self.assets = tuple(dict.fromkeys(asset for character in self._characters for asset in character.assets))
         self._range, self._height = recipe.bone_scale, recipe.height
+        self._rest = kept(self._stretched)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """The character's number, then factors uniform within 1 +- the recipe's ``bone_scale``."""
@@ -63,7 +64,7 @@ class RiggedModel:
         drivers = drivers_of(character.names, character.parents, joints)
         return rig_of(self._rest(parameters), character.names, drivers)
 
-    def _rest(self, parameters: NDArray[np.float64]) -> Rest:
+    def _stretched(self, parameters: NDArray[np.float64]) -> Rest:
         number = int(parameters[0])
         character = self._characters[number]
         factors = dict(zip(self.parameter_names[1:], parameters[1:].tolist(), strict=True))

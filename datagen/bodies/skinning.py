@@ -8,8 +8,9 @@ factors of products of 2^-24), so that float64 holds every product and every sum
 summation does not matter, and the bytes of a shard do not depend on the CPU, the BLAS or the number of threads.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from datagen.mesh.rig import Rig, part_transforms
 
-_POSES_AT_ONCE = 32  # bounds memory: 32 poses x 13,718 vertices x 3 coordinates x 8 bytes = 11 MB, about a CPU cache
+VERTICES_AT_ONCE = 2**18
+"""Of some poses together: 6 MB of float64, which stay in a CPU's cache and in memory that malloc does not give back."""
 _COARSE, _FINE = 2.0**20, 2.0**24
 _FEW_JOINTS = 3  # of so many a dense product is the quicker one; exact as it is, its numbers are the same
 _EXACT_WITHIN = 4.0  # metres from the origin; a larger body's steps are larger by powers of two
@@ -35,6 +37,32 @@ class Rest:
     weights: Weights
     parents: Sequence[int]
 
+    @cached_property
+    def prepared(self) -> "_Prepared":
+        """What all its poses have in common."""
+        scale = _scale(self)
+        coarse, fine = _COARSE / scale, _FINE / scale
+        few = isinstance(self.weights, np.ndarray) and self.weights.shape[1] <= _FEW_JOINTS
+        weights = self.weights if few else scipy.sparse.csr_array(self.weights)
+        factors = _factors(_round(self.vertices, coarse), weights, fine)
+        return _Prepared(_round(self.joints, fine), weights, factors, fine)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """An identity for the product: joints [joint, 3], weights, M [vertex, 4 joint], and steps to a metre."""
+
+    joints: NDArray[np.float64]
+    weights: Weights
+    factors: Weights
+    fine: float
+
+
+def kept(rest: Callable[[NDArray[np.float64]], Rest]) -> Callable[[NDArray[np.float64]], Rest]:
+    """Let a body's function from parameters to rest remember its last identities: tasks ask for few poses at once."""
+    last = lru_cache(maxsize=4)(lambda values: rest(np.array(values)))
+    return lambda parameters: last(tuple(parameters.tolist()))
+
 
 def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
     """Posed vertices [pose, vertex, 3] float32: each vertex moved by its weighted mean of joint transforms.
@@ -48,20 +76,17 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     correctives
         Displacements [pose, vertex, 3] of the rest vertices in metres, such as SMPL's pose blend shapes.
     """
-    scale = _scale(rest)
-    coarse, fine = _COARSE / scale, _FINE / scale
-    rest = Rest(_round(rest.vertices, coarse), _round(rest.joints, fine), rest.weights, rest.parents)
-    world = _round(world, _COARSE)
-    few = isinstance(rest.weights, np.ndarray) and rest.weights.shape[1] <= _FEW_JOINTS
-    weights = rest.weights if few else scipy.sparse.csr_array(rest.weights)
-    factors = _factors(rest.vertices, weights, fine)
-    posed = np.empty((len(world), len(rest.vertices), 3), np.float32)
-    for first in range(0, len(world), _POSES_AT_ONCE):
-        some = slice(first, first + _POSES_AT_ONCE)
-        transforms = _round(part_transforms(world[some], rest.joints, rest.parents), fine)
+    body, world, count = rest.prepared, _round(world, _COARSE), len(rest.vertices)
+    posed = np.empty((len(world), count, 3), np.float32)
+    at_once = max(1, VERTICES_AT_ONCE // max(1, count))
+    for first in range(0, len(world), at_once):
+        some = slice(first, first + at_once)
+        transforms = _round(part_transforms(world[some], body.joints, rest.parents), body.fine)
         columns = np.ascontiguousarray(transforms.transpose(1, 3, 0, 2)).reshape(-1, 3 * len(transforms))
-        vertices = (factors @ columns).reshape(len(rest.vertices), -1, 3).transpose(1, 0, 2)
-        posed[some] = vertices if correctives is None else vertices + _turned(weights, world[some], correctives[some])
+        vertices = (body.factors @ columns).reshape(count, -1, 3).transpose(1, 0, 2)
+        if correctives is not None:
+            vertices = vertices + _turned(body.weights, world[some], correctives[some])
+        posed[some] = vertices
     return posed
 
 

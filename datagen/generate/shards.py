@@ -7,7 +7,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies import BodyModel, load_body
+from datagen.bodies import load_body
+from datagen.bodies.skinning import VERTICES_AT_ONCE
 from datagen.common.errors import BodyError
 from datagen.generate.identities import identity_parameters
 from datagen.generate.plan import READS_FOLDERS, assets_of
@@ -27,22 +28,47 @@ TASK_SECONDS, _FEWEST_TASKS = 0.5, 64
 """Of work in a task at most, and tasks at least: for many workers, and for progress that is seen."""
 
 
-def make_shard(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
-    """Vertices [identity, pose, vertex, 3] of one shard in metres, Y up: a pure function of its arguments.
+def make_shard(recipe: DatasetRecipe, shard: Shard) -> Iterator[tuple[NDArray[np.float32], Bounds]]:
+    """The meshes of a shard in the order of its rows, as many at a time as a CPU's cache holds: a pure function.
+
+    Yields
+    ------
+    vertices
+        [mesh, vertex, 3] in metres, Y up.
+    bounds
+        Their lowest and highest coordinates, each [mesh, 3].
 
     Raises
     ------
     BodyError
-        The body model gave other vertices than planned.
+        The body model gave other vertices than planned, vertices that are not finite, or a mesh without extent.
     """
-    body, poses = load_body(recipe.body), _poses(recipe.poses.model_dump_json(), shard.poses)
-    made = (_meshes(recipe, body, identity, shard, poses) for identity in shard.identities)
-    if len(shard.identities) == 1:
-        return next(made)[None]
-    meshes = np.empty((len(shard.identities), len(shard.poses), shard.vertices, 3), np.float32)
-    for place, vertices in enumerate(made):
-        meshes[place] = vertices
-    return meshes
+    body, recipe_of_poses = load_body(recipe.body), recipe.poses.model_dump_json()
+    at_once = max(1, VERTICES_AT_ONCE // shard.vertices)
+    for identity in shard.identities:
+        parameters = identity_parameters(recipe, body, identity)
+        for first in range(0, len(shard.poses), at_once):
+            numbers = shard.poses[first : first + at_once]
+            vertices = body.vertices(parameters, _poses(recipe_of_poses, numbers))
+            yield vertices, _sound_bounds(shard, identity, parameters, numbers, vertices)
+
+
+def _sound_bounds(
+    shard: Shard, identity: int, parameters: NDArray[np.float64], poses: range, vertices: NDArray[np.float32]
+) -> Bounds:
+    if vertices.shape[1] != shard.vertices:
+        raise BodyError(
+            f"identity {identity} has {vertices.shape[1]:,} vertices in pose {poses[0]}, and had {shard.vertices:,} "
+            "when the dataset was begun. Use the files that it was begun with, and run again"
+        )
+    low, high = bounds(vertices)
+    sound = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & ((high - low).max(axis=1) > 0)
+    if not sound.all():
+        raise BodyError(
+            f"identity {identity} (parameters {parameters.tolist()}) has a degenerate or non-finite mesh in pose "
+            f"{poses[int(np.argmin(sound))]}. Narrow the identity ranges of the recipe"
+        )
+    return low, high
 
 
 _kept: dict[tuple[str, range], Poses] = {}
@@ -60,37 +86,6 @@ def _poses(recipe: str, numbers: range) -> Poses:
         while sum(map(len, _kept.values())) > _KEPT_POSES:  # the block that was asked for longest ago
             del _kept[next(iter(_kept))]
     return poses
-
-
-def _meshes(recipe: DatasetRecipe, body: BodyModel, identity: int, shard: Shard, poses: Poses) -> NDArray[np.float32]:
-    vertices = body.vertices(identity_parameters(recipe, body, identity), poses)
-    if vertices.shape[1] != shard.vertices:
-        raise BodyError(
-            f"identity {identity} has {vertices.shape[1]:,} vertices in pose {shard.poses[0]}, and had "
-            f"{shard.vertices:,} when the dataset was begun. Use the files that it was begun with, and run again"
-        )
-    return vertices
-
-
-def sound_bounds(recipe: DatasetRecipe, shard: Shard, meshes: NDArray[np.float32]) -> Bounds:
-    """Lowest and highest coordinates [mesh, 3] of the meshes of a shard.
-
-    Raises
-    ------
-    BodyError
-        Some are not finite, or a mesh has no extent.
-    """
-    low, high = bounds(meshes.reshape(-1, *meshes.shape[2:]))
-    sound = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & ((high - low).max(axis=1) > 0)
-    faulty = np.flatnonzero(~sound.reshape(meshes.shape[:2]).all(axis=1))
-    if len(faulty):
-        identity = shard.identities[faulty[0]]
-        parameters = identity_parameters(recipe, load_body(recipe.body), identity)
-        raise BodyError(
-            f"identity {identity} (parameters {parameters.tolist()}) has a degenerate or non-finite mesh in "
-            f"poses {shard.poses[0]} to {shard.poses[-1]}. Narrow the identity ranges of the recipe"
-        )
-    return low, high
 
 
 def batches(recipe: DatasetRecipe, shards: Sequence[Wanted]) -> Iterator[list[Wanted]]:
@@ -124,8 +119,7 @@ def _ensured(writer: ShardWriter, recipe: DatasetRecipe, shard: Shard, committed
     row = existing_shard(writer.group, recipe, shard)
     if row is not None and committed in (None, row.sha256):
         return row
-    meshes = make_shard(recipe, shard)
-    return writer.write(shard, meshes, bounds=sound_bounds(recipe, shard, meshes), committed=committed)
+    return writer.write(shard, make_shard(recipe, shard), committed=committed)
 
 
 @lru_cache(maxsize=64)

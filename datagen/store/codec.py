@@ -9,7 +9,7 @@ this a few microseconds.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -71,14 +71,21 @@ class ShardCodec:
         """Rows of the cells of the first ``identities`` and ``poses``, identity by identity."""
         return np.add.outer(np.arange(identities) * self.poses, np.arange(poses)).ravel()
 
-    def encode(self, meshes: NDArray[np.float32]) -> bytes:
-        """The file that holds meshes [identity, pose, vertex, 3]; the cells after them are left empty."""
+    def encode(self, meshes: Iterable[NDArray[np.float32]], identities: int, poses: int) -> bytes:
+        """The file that holds the meshes of some identities in some poses; the cells after them are left empty.
+
+        Parameters
+        ----------
+        meshes
+            Vertices [mesh, vertex, 3], identity by identity, some meshes at a time.
+        identities, poses
+            How many of each these are.
+        """
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
-        flat = np.ascontiguousarray(meshes, "<f4").reshape(-1, self.vertices, 3)
-        chunks = [bytes(compressor.encode(mesh)) for mesh in flat]
+        chunks = [compressor.encode(mesh) for some in meshes for mesh in np.ascontiguousarray(some, "<f4")]
         sizes = np.array([len(chunk) + _CHECKSUM.size for chunk in chunks], np.uint64)
         index = np.full((self.rows, 2), _NOTHING, "<u8")
-        index[self.rows_of(*meshes.shape[:2])] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)
+        index[self.rows_of(identities, poses)] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)
         return b"".join(part for chunk in (*chunks, index.tobytes()) for part in (chunk, _checksum(chunk)))
 
     def decode(self, file: bytes, rows: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -5,7 +5,7 @@ are not there yet, a shard is written once and whole by one task, and ``status: 
 """
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -234,23 +234,39 @@ class ShardWriter:
             )
 
     def write(
-        self, shard: Shard, vertices: NDArray[np.float32], *, bounds: Bounds, committed: str | None = None
+        self, shard: Shard, meshes: Iterable[tuple[NDArray[np.float32], Bounds]], *, committed: str | None = None
     ) -> ManifestRow:
-        """Write one whole shard, vertices [identity, pose, vertex, 3] of some bounds, and return its manifest row.
+        """Write one whole shard, and return its manifest row.
+
+        Parameters
+        ----------
+        shard
+            Where it belongs.
+        meshes
+            Vertices [mesh, vertex, 3] and bounds of its rows, in order, some at a time.
+        committed
+            The sha256 that the dataset's manifest has of it, if any.
 
         Raises
         ------
         DatasetError
-            The bytes are not those that the dataset's manifest has (``committed``, their sha256), or not of its
-            array's shape; nothing is written then.
+            The bytes are not those that were committed, or the meshes are not of its array's shape; nothing is
+            written then.
         """
-        expected = (len(shard.identities), len(shard.poses), shard.vertices, 3)
-        if vertices.shape != expected:
-            raise DatasetError(
-                f"{self._url}: shard {shard.path} came out of shape {vertices.shape} instead of {expected}"
-            )
-        content = codec_of(self._recipe, shard).encode(vertices)
-        row = row_of(shard, content, bounds)
+        lows, highs = list[NDArray[np.float32]](), list[NDArray[np.float32]]()
+
+        def looked_at() -> Iterator[NDArray[np.float32]]:
+            count = 0
+            for vertices, (low, high) in meshes:
+                self._require_shape(shard, vertices.shape[1:], (shard.vertices, 3))
+                lows.append(low)
+                highs.append(high)
+                count += len(vertices)
+                yield vertices
+            self._require_shape(shard, (count,), (shard.rows,))
+
+        content = codec_of(self._recipe, shard).encode(looked_at(), len(shard.identities), len(shard.poses))
+        row = row_of(shard, content, (np.concatenate(lows), np.concatenate(highs)))
         if committed not in (None, row.sha256):
             raise DatasetError(
                 f"{self._url}: shard {shard.path} was made again, but not the same: other package versions made it "
@@ -264,6 +280,10 @@ class ShardWriter:
                     f"{self._url}: shard {shard.path} is not there as it was written; is the storage sound?"
                 )
         return row
+
+    def _require_shape(self, shard: Shard, found: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+        if found != wanted:
+            raise DatasetError(f"{self._url}: shard {shard.path} came out with meshes of shape {found}, not {wanted}")
 
 
 def existing_shard(group: zarr.Group, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:

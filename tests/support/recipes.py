@@ -2,6 +2,10 @@
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.generate import make_shard
 from datagen.generate.plan import plan_of
 from datagen.grid import Shard
 from datagen.recipe import DatasetRecipe
@@ -23,6 +27,12 @@ def tiny_dataset(**changes: Any) -> DatasetRecipe:
 def shards_of(recipe: DatasetRecipe) -> list[Shard]:
     """All shards of a recipe's dataset."""
     return plan_of(recipe).arrays.shards()
+
+
+def vertices_of(recipe: DatasetRecipe, shard: Shard) -> NDArray[np.float32]:
+    """The meshes of a shard, vertices [identity, pose, vertex, 3]."""
+    meshes = np.concatenate([vertices for vertices, _ in make_shard(recipe, shard)])
+    return meshes.reshape(len(shard.identities), len(shard.poses), shard.vertices, 3)
 
 
 def tiny_training(**changes: Any) -> TrainingRecipe:

@@ -8,7 +8,6 @@ Everything is added up element by element in a fixed order: a matrix product wou
 number of threads, as would the basis that Anny compacts its blend shapes into (its singular vectors differ by 1e-8).
 """
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -32,13 +31,12 @@ class AnnyShape:
         self._blends = _flat(vertices[: len(mask)][used], heads[: len(mask)][used])
         self._local = scipy.sparse.csr_array(_flat(vertices[len(mask) :], heads[len(mask) :]))
         self._template = _flat(model.template_vertices.numpy()[None], model.template_bone_heads.numpy()[None])[0]
-        self.points = lru_cache(maxsize=4)(self._points)  # a worker makes several shards of one identity in a row
 
     def heads(self, parameters: tuple[float, ...]) -> NDArray[np.float64]:
         """Bone heads [bone, 3] alone: the last of the points, to the bit, at a fraction of the time."""
-        return self._points(parameters, first=self._vertices)
+        return self.points(parameters, first=self._vertices)
 
-    def _points(self, parameters: tuple[float, ...], first: int = 0) -> NDArray[np.float64]:
+    def points(self, parameters: tuple[float, ...], first: int = 0) -> NDArray[np.float64]:
         """Points [point, 3] from number ``first`` on, of phenotypes in their order, followed by local changes."""
         values = dict(zip(self.phenotypes, parameters, strict=False))
         flat = self._template[3 * first :].copy()

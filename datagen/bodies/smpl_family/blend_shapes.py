@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies.skinning import Rest, skin
+from datagen.bodies.skinning import Rest, kept, skin
 from datagen.bodies.smpl_family.model_file import ModelFile
 from datagen.common.errors import BodyError
 
@@ -42,8 +42,9 @@ class LayoutBody:
         self._regressor = _exact_beside(file.regressor, largest=extent, steps=_SHAPED_STEPS, axis=1)
         by_feature = np.ascontiguousarray(file.posedirs.reshape(-1, file.posedirs.shape[-1]).T)
         self._posedirs = _exact_beside(by_feature, largest=2.0, steps=_STEPS, axis=0) if by_feature.any() else None
+        self.rest = kept(self._rest)
 
-    def rest(self, betas: NDArray[np.float64]) -> Rest:
+    def _rest(self, betas: NDArray[np.float64]) -> Rest:
         """The identity of shape parameters [beta]: SMPL's equations 8 and 10, by the reference implementation."""
         import torch
         from smplx.lbs import blend_shapes, vertices2joints  # type: ignore[import-untyped,unused-ignore]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datagen.bodies import load_body
+from datagen.bodies import load_body, skinning
 from datagen.bodies.skinning import Rest, skin
 from datagen.common.seeding import Stream, generator
 from datagen.poses import draw_poses
@@ -55,7 +55,8 @@ def test_it_is_linear_blend_skinning(size: float, corrected: bool) -> None:
     assert np.abs(found - expected).max() < (3e-6 if size <= 1 else 1e-5 * size)  # beyond 4 m the steps are wider
 
 
-def test_many_poses_are_what_single_ones_are() -> None:
+def test_many_poses_are_what_single_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(skinning, "VERTICES_AT_ONCE", 32 * 50)
     world = rotations(70)
     together = skin(rest(), world)
     assert all(np.array_equal(together[i : i + 1], skin(rest(), world[i : i + 1])) for i in (0, 31, 32, 69))

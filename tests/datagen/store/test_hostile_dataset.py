@@ -465,7 +465,7 @@ def test_a_shard_whose_header_lies_is_damaged_and_never_half_filled(spoilable: P
     from datagen.store.codec import ShardCodec
 
     codec, small = ShardCodec(1, 1, 40, "lz4", 5), ShardCodec(1, 1, 32, "lz4", 5)
-    file = small.encode(np.ones((1, 1, 32, 3), np.float32))
+    file = small.encode([np.ones((1, 32, 3), np.float32)], 1, 1)
     with pytest.raises(ShardDamage, match="384 bytes instead of 480"):
         codec.decode(file, codec.rows_of(1, 1))
     chunk, out = bytearray(file[: -small.index_bytes]), np.empty((32, 3), np.float32)

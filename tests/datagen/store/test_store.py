@@ -10,14 +10,14 @@ import pytest
 import zarr
 
 from datagen.common.errors import DatasetError, StorageError
-from datagen.generate import ensure_shards, generate, make_shard, repair
+from datagen.generate import ensure_shards, generate, repair
 from datagen.store import open_dataset
 from datagen.store.codec import ShardCodec
 from datagen.store.schema import attributes_of, open_group
 from datagen.store.verify import describe, find_faults
 from tests.support.files import flip_bit, tree_hash, truncate
 from tests.support.layout import layout
-from tests.support.recipes import shards_of, tiny_dataset
+from tests.support.recipes import shards_of, tiny_dataset, vertices_of
 from workflows.cli.main import main
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "dataset_layout.json"
@@ -38,7 +38,7 @@ def test_what_is_read_is_what_was_made(dataset: str) -> None:
     assert recipe == tiny_dataset()
     for shard in opened.arrays.shards():
         vertices = [opened.vertices(identity, shard.poses) for identity in shard.identities]
-        assert np.array_equal(vertices, make_shard(recipe, shard))
+        assert np.array_equal(vertices, vertices_of(recipe, shard))
     assert np.array_equal(opened.vertices(4, 9), opened.vertices(4)[9])
     assert np.array_equal(opened.evaluation_triples("unseen"), grid.evaluation_triples("unseen"))
     assert opened.identities("evaluation") == [3, 4]

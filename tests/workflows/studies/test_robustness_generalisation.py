@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from datagen.common.errors import RecipeError
-from datagen.generate import generate, make_shard
+from datagen.generate import generate
 from datagen.recipe import AnnyBody, DatasetRecipe, NptPoses
 from datagen.store import open_dataset
-from tests.support.recipes import shards_of, tiny_dataset, tiny_training
+from tests.support.recipes import shards_of, tiny_dataset, tiny_training, vertices_of
 from training.engine.trainer import train
 from training.evaluation.generalisation import have_truth
 from training.evaluation.results import read_csv
@@ -143,7 +143,7 @@ def test_people_are_the_same_in_every_topology_and_new() -> None:
     sizes = Sizes(identities=2, poses=2, triples=2)
     coarse, fine = (people_recipe(base, name, sizes) for name in ("notoes_collapse3pc", "notoes_collapse5pc"))
     assert isinstance(fine.body, AnnyBody) and fine.body.phenotypes.age == (0, 1) and fine.identities.seed == sizes.seed
-    (first, *_), (second, *_) = (make_shard(its, shards_of(its)[0]) for its in (coarse, fine))
+    (first, *_), (second, *_) = (vertices_of(its, shards_of(its)[0]) for its in (coarse, fine))
     assert first.shape[1:] == (369, 3) and second.shape[1:] == (615, 3)
     np.testing.assert_allclose(np.ptp(first, axis=1), np.ptp(second, axis=1), atol=0.06)
 
