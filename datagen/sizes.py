@@ -99,9 +99,8 @@ def require_disk(size: DatasetSize, url: str) -> None:
         It has not.
     """
     folder = Path(url)
-    there = sum(file.stat().st_size for file in files_below(folder))
     free = free_disk(folder)
-    if size.disk - there > free:
+    if size.disk > free and size.disk - sum(file.stat().st_size for file in files_below(folder)) > free:
         raise StorageError(
             f"{url} will take about {bytes_text(size.disk)}, but its disk has {bytes_text(free)} left. Make room, "
             "choose another --out, lower data.identities or data.poses, or continue all the same with --yes"

@@ -57,15 +57,16 @@ def resolve_within(folder: Path, name: str) -> Path:
     return path
 
 
-def files_below(folder: Path | str) -> Iterator["os.DirEntry[str]"]:
+def files_below(folder: Path | str, *, but: str | None = None) -> Iterator["os.DirEntry[str]"]:
     """Every file below a folder, links to files among them, in no order; no link to a folder is followed.
 
-    What is not there, or may not be looked into, holds none.
+    What is not there, or may not be looked into, holds none; so do folders whose path ends as ``but`` says.
     """
     with suppress(FileNotFoundError, NotADirectoryError, PermissionError), os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
-                yield from files_below(entry.path)
+                if but is None or not entry.path.endswith(but):
+                    yield from files_below(entry.path, but=but)
             elif entry.is_file(follow_symlinks=False) or (entry.is_symlink() and os.path.isfile(entry.path)):
                 yield entry
 

@@ -198,7 +198,7 @@ def _make_missing(
     faults: Sequence[Fault] = (),
 ) -> None:
     """Make what is missing of a dataset, which grows from ``before``, or of which ``faults`` were found."""
-    known = known_shards(url, {fault.path for fault in faults})
+    known = SoFar(before.manifest) if before else known_shards(url, {fault.path for fault in faults})
     lost = [fault.path for fault in faults if not fault.shard]
     arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, so_far=known)
     if faults:  # before anything is made: a run after this one must know what is faulty
@@ -217,7 +217,7 @@ def _make_missing(
         results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
-    finish(url, recipe, rows)
+    finish(url, recipe, rows, before=before.sizes if before else ())
 
 
 @contextmanager

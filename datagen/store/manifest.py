@@ -19,8 +19,8 @@ from datagen.common.errors import UnsafeFileError, reason_of
 from datagen.grid import SPLITS, GridArrays, Place, Shard, shard_path
 from datagen.mesh.geometry import Bounds
 from datagen.store.arrays import put_array, put_group, read_array, read_json
-from datagen.store.object_names import is_member, require_member
-from datagen.store.objects import list_objects, read_bytes, write_bytes
+from datagen.store.object_names import require_member
+from datagen.store.objects import list_small_objects, read_bytes, write_bytes
 from datagen.store.schema import MOST_SHARDS, attributes_of
 
 SEAL = "attributes_sha256"
@@ -203,7 +203,7 @@ def commit(
 
     ``objects`` are those of the manifest before, where none but shards has been written since.
     """
-    hashes = objects or {path: _sha256(read_bytes(group, path) or b"") for path in _small_objects(group)}
+    hashes = objects or {path: _sha256(read_bytes(group, path) or b"") for path in _hashed_objects(group)}
     manifest = manifest_of(rows, hashes)
     put_group(group, "manifest", {"objects": list(hashes)})
     put_array(group, _OBJECTS, manifest.object_hashes, ("object", "byte"))
@@ -290,9 +290,8 @@ def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str
             yield path, "its sha256 is not the manifest's"
 
 
-def _small_objects(group: zarr.Group) -> list[str]:
-    paths = (path for path in list_objects(group) if is_member(path) and "/vertices/c/" not in path)
-    return [path for path in paths if path != "zarr.json" and not path.startswith("manifest/")]
+def _hashed_objects(group: zarr.Group) -> list[str]:
+    return [path for path in list_small_objects(group) if path != "zarr.json" and not path.startswith("manifest/")]
 
 
 def _digest(content: Any) -> str:

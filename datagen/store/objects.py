@@ -7,7 +7,8 @@ regular files only.
 
 import os
 import stat
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +22,9 @@ from datagen.common.errors import DatasetError, UnsafeFileError
 from datagen.common.files import files_below, open_regular, read_bounded, resolve_within
 from datagen.store.object_names import is_leftover, is_member, limit_of, require_member, require_short
 from datagen.store.remote_objects import S3_OPTIONS, RemoteObjects
+
+_SHARDS = "/vertices/c"
+"""How the path of an array's folder of shards ends."""
 
 
 class LocalObjects(LocalStore):
@@ -65,7 +69,12 @@ class LocalObjects(LocalStore):
         return sorted(os.listdir(self.root)) if self.root.is_dir() else []
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        for file in files_below(self.root / prefix.rstrip("/")):  # Zarr's own way takes several times as long
+        for path in self.paths(prefix):  # Zarr's own way takes several times as long
+            yield path
+
+    def paths(self, prefix: str = "", *, but: str | None = None) -> Iterator[str]:
+        """Paths of all files below a folder, but those below folders whose path ends so."""
+        for file in files_below(self.root / prefix.rstrip("/"), but=but):
             yield file.path.removeprefix(f"{self.root}/")
 
     def _place(self, path: str) -> Path:
@@ -215,11 +224,27 @@ def delete_object(group: zarr.Group, path: str) -> None:
 
 def list_objects(group: zarr.Group) -> list[str]:
     """Paths of all objects of the dataset's store, and of what killed writers left of some, sorted."""
+    return sorted(path for path in _paths(group) if is_member(path) or is_leftover(path))
 
+
+def list_leftovers(group: zarr.Group, shards: Iterable[str]) -> list[str]:
+    """Paths of what killed writers left beside these shards, and of all objects but shards."""
+    if isinstance(store := group.store, LocalObjects):
+        beside = (store.paths(path.rpartition("/")[0]) for path in shards)
+        return [path for path in chain(store.paths(but=_SHARDS), *beside) if is_leftover(path)]
+    return [path for path in _paths(group) if is_leftover(path)]
+
+
+def list_small_objects(group: zarr.Group) -> list[str]:
+    """Paths of all objects but shards, sorted; folders of shards, of which there may be many, are not looked into."""
+    return sorted(path for path in _paths(group, but=_SHARDS) if is_member(path) and f"{_SHARDS}/" not in path)
+
+
+def _paths(group: zarr.Group, *, but: str | None = None) -> Iterable[str]:
     async def listed() -> list[str]:
         return [key async for key in group.store.list_prefix("")]
 
-    return sorted(path for path in sync(listed()) if is_member(path) or is_leftover(path))
+    return group.store.paths(but=but) if isinstance(group.store, LocalObjects) else sync(listed())
 
 
 def stored_sizes(group: zarr.Group, paths: list[str]) -> dict[str, int]:

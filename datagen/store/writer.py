@@ -35,7 +35,7 @@ from datagen.store.manifest import (
     row_of,
 )
 from datagen.store.object_names import MEMBERS
-from datagen.store.objects import delete_object, list_objects, read_bytes, stored_sizes, write_bytes
+from datagen.store.objects import delete_object, list_leftovers, read_bytes, stored_sizes, write_bytes
 from datagen.store.schema import (
     FORMAT_VERSION,
     attributes_of,
@@ -363,8 +363,10 @@ def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
             put_so_far(group, so_far)
 
 
-def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
+def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, before: Collection[str] = ()) -> None:
     """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
+
+    ``before`` are the paths of shards of a complete dataset that this one grew from: nobody has written them since.
 
     Raises
     ------
@@ -383,9 +385,8 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
         for row in rows:
             if sizes.get(row.path) != row.bytes:
                 raise DatasetError(f"{url}: shard {row.path} was changed by somebody else. Run the same command again")
-        for path in list_objects(group):
-            if path.endswith(".partial"):
-                delete_object(group, path)
+        for path in list_leftovers(group, [row.path for row in rows if row.path not in before]):
+            delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None
         objects = manifest.objects if manifest else None
         put_so_far(group, SoFar(rows))
