@@ -23,6 +23,7 @@ VERTICES_AT_ONCE = 2**18
 """Of some poses together: 6 MB of float64, which stay in a CPU's cache and in memory that malloc does not give back."""
 _COARSE, _FINE = 2.0**20, 2.0**24
 _FEW_JOINTS = 3  # of so many a dense product is the quicker one; exact as it is, its numbers are the same
+_ONE_THREAD = 2**18  # multiplications of a dense product, which larger BLAS divides among threads that wait for longer
 _EXACT_WITHIN = 4.0  # metres from the origin; a larger body's steps are larger by powers of two
 
 Weights: TypeAlias = NDArray[np.float64] | scipy.sparse.csr_array
@@ -78,7 +79,10 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     """
     body, world, count = rest.prepared, _round(world, _COARSE), len(rest.vertices)
     posed = np.empty((len(world), count, 3), np.float32)
-    at_once = max(1, VERTICES_AT_ONCE // max(1, count))
+    at_once = VERTICES_AT_ONCE // max(1, count)
+    if isinstance(body.factors, np.ndarray):
+        at_once = min(at_once, _ONE_THREAD // max(1, 3 * body.factors.size))
+    at_once = max(1, at_once)
     for first in range(0, len(world), at_once):
         some = slice(first, first + at_once)
         transforms = _round(part_transforms(world[some], body.joints, rest.parents), body.fine)
