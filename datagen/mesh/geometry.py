@@ -72,7 +72,8 @@ def bounding_box(vertices: NDArray[np.floating]) -> Box:
 
     Each mesh is moved so that its box is centred on the origin and divided by half the longest edge of the box.
     """
-    low, high = vertices.min(axis=-2), vertices.max(axis=-2)
+    found = bounds(vertices.reshape(-1, *vertices.shape[-2:]))
+    low, high = (each.reshape(*vertices.shape[:-2], 3) for each in found)
     return Box((low + high) / 2, (high - low).max(axis=-1) / 2)
 
 
@@ -107,7 +108,7 @@ def _on_side(points: Floats, corners: Floats, start: int) -> NDArray[np.float64]
 
 def standing_point(vertices: Floats) -> NDArray[np.float64]:
     """The point [3] of the ground below the middle of the box of vertices [n, 3] with Y up, at their lowest height."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = (each[0] for each in bounds(vertices[None]))
     return np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
 
 

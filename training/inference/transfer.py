@@ -253,10 +253,9 @@ class PoseTransfer:
             turn = self._turned_round(vertices, turn)
             read = vertices @ turn
             output = posed(Mesh(read, mesh.faces)) @ turn.T
-            trajectory = trajectory or RootTrajectory(
-                standing_point(vertices), scale_of(target, output) / float(bounding_box(read).half)
-            )
-            yield placed(target, output) + trajectory.offset(vertices)
+            scale = scale_of(target, output)
+            trajectory = trajectory or RootTrajectory(standing_point(vertices), scale / float(bounding_box(read).half))
+            yield placed(target, scale * output) + trajectory.offset(vertices)
 
 
 def _is_same_mesh(one: Mesh, other: Mesh) -> bool:
@@ -295,9 +294,8 @@ def scale_of(target: Mesh, vertices: Floats) -> float:
 
 
 def placed(target: Mesh, vertices: Floats) -> Floats:
-    """Vertices [n, 3] in the normalised box -> the target's size and place; all with Y up."""
-    sized = vertices * scale_of(target, vertices)
-    return sized - standing_point(sized) + standing_point(target.vertices)
+    """Vertices [n, 3] of the target's size -> where the target stands; all with Y up."""
+    return vertices - standing_point(vertices) + standing_point(target.vertices)
 
 
 def _side_lengths(vertices: Floats, faces: NDArray[np.integer]) -> Floats:

@@ -14,7 +14,7 @@ from datagen.mesh.geometry import Mesh, bounding_box, standing_point
 from tests.support.three_networks import lively
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.smoothing import smoothed
-from training.inference.transfer import PoseTransfer, placed
+from training.inference.transfer import PoseTransfer, placed, scale_of
 from training.networks import build_network
 from training.networks.parts import Parts
 
@@ -57,6 +57,11 @@ def test_frames_may_have_more_vertices_though_the_same_faces_and_stand_otherwise
         np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-4)
 
 
+def sized(target: Mesh, output: np.ndarray) -> np.ndarray:
+    """An output at the target's size and place."""
+    return placed(target, scale_of(target, output) * output)
+
+
 def test_a_target_is_read_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     transfer, reads = PoseTransfer(lively("parts")), []
     read_target = Parts.read_target
@@ -66,7 +71,7 @@ def test_a_target_is_read_once_for_all_frames(monkeypatch: pytest.MonkeyPatch) -
     frames = list(transfer.sequence(sources, target, source_axes=UPRIGHT, target_axes=UPRIGHT))
     assert len(reads) == 1
     for frame, source in zip(frames, sources, strict=True):
-        moved = frame.vertices - placed(target, transfer.unplaced(source, target))
+        moved = frame.vertices - sized(target, transfer.unplaced(source, target))
         np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-6)  # the way through space
 
 
@@ -76,7 +81,7 @@ def test_what_is_near_among_points_is_found_for_each_frame(monkeypatch: pytest.M
     monkeypatch.setattr(transfer, "_turned_round", lambda vertices, before: np.eye(3))
     clouds = [Mesh(random.normal(size=(300, 3)) * (0.1, 1, 0.1), np.zeros((1, 3), np.int64)) for _ in range(2)]
     frames = list(transfer.sequence(clouds, mesh_of(2), source_axes=UPRIGHT, target_axes=UPRIGHT))
-    moved = frames[1].vertices - placed(mesh_of(2), transfer.unplaced(clouds[1], mesh_of(2)))
+    moved = frames[1].vertices - sized(mesh_of(2), transfer.unplaced(clouds[1], mesh_of(2)))
     np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-6)
 
 
