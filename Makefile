@@ -13,8 +13,6 @@ UI_PORT ?= 5000
 
 TORCH := torch==2.13.0
 BIN := .venv/bin
-# Some containers ask Python to keep nothing that it compiles: then pip leaves packages uncompiled, and each command starts by compiling torch.
-unexport PYTHONDONTWRITEBYTECODE
 # Written last. An environment whose installation was cut short has no such file, and is made anew.
 READY := .venv/.ready
 PIP_FLAGS = --disable-pip-version-check $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))

@@ -38,12 +38,22 @@ def main() -> int:
     if status and command[0] != str(python):
         say("uv could not install them; pip tries")
         status = followed(by_pip(python))
+    if status == 0 and sys.dont_write_bytecode:
+        compile_packages(python)
     if status == 0:
         (VENV / ".ready").touch()
         say(f"{installed()} packages in .venv, after {time.monotonic() - began:.0f} s")
     else:
         say("the packages could not be installed; the same command resumes from what was fetched")
     return status
+
+
+def compile_packages(python: Path) -> None:
+    """Compile them once, where PYTHONDONTWRITEBYTECODE is set as in some containers; each command would, else."""
+    say("compiling the packages, half a minute: Python is told to keep nothing of what it compiles later")
+    packages = next((VENV / "lib").glob("python3*/site-packages"))
+    command = [str(python), "-m", "compileall", "-q", "-q", "-j", "0", str(packages)]
+    subprocess.run(command, check=False)  # some hold templates, and code for other versions of Python
 
 
 def installer(python: Path) -> list[str]:

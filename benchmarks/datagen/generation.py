@@ -4,8 +4,9 @@
 
 For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
 skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
-forward, this project's body alone, and tasks of whole shards (identity, pose, check, compress, checksum, hash, write).
-Then reading, size, a worker's memory, and one against two Ray workers.
+forward, this project's body alone (another identity in each round, as in each shard), and tasks of whole shards
+(identity, pose, check, compress, checksum, hash, write). Then reading, size, a worker's memory, and one against two
+Ray workers.
 """
 
 import os
@@ -84,7 +85,8 @@ def measure(topology: str, folder: Path) -> None:
     """Measure and print one topology's table."""
     recipe, url = recipe_of(topology), str(folder / f"{topology}.zarr")
     body = load_body(recipe.body)
-    parameters = body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, 0), 0)
+    people = [body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, n), n) for n in range(ROUNDS + 1)]
+    parameters = people[0]
     poses, faces = draw_poses(recipe.poses, range(POSES)), body.faces(parameters)
     shards = prepare(url, recipe).shards()
     forward = annys_own_forward(topology)
@@ -101,10 +103,10 @@ def measure(topology: str, folder: Path) -> None:
             ONE_AT_A_TIME,
         ),
         "anny": (forward, POSES),
-        "body": (lambda: body.vertices(parameters, poses), POSES),
+        "body": (lambda: body.vertices(people.pop(), poses), POSES),
         "shard": (lambda: ensure_shards(url, recipe, [(todo.pop(), None) for _ in range(SHARDS)]), SHARDS * POSES),
     }
-    forward(), body.vertices(parameters, poses)
+    forward(), body.vertices(people.pop(), poses)
     found = {name: [] for name in ways}  # type: dict[str, list[float]]
     for _ in range(ROUNDS):
         for name, (work, meshes) in ways.items():

@@ -37,7 +37,11 @@ class BodyModel(Protocol):
         ...
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
-        """Vertices [pose, vertex, 3] in metres, Y up, facing +Z."""
+        """Vertices [pose, vertex, 3] in metres, Y up, facing +Z.
+
+        A shard asks several times for some poses of one identity, so what is dear about an identity is to be remembered
+        (:func:`datagen.bodies.skinning.remembering`).
+        """
         ...
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig | None:

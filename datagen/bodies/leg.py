@@ -7,7 +7,7 @@ family is added. Identity: length, thigh and ankle radius, knee height. It obeys
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies.skinning import Rest, kept, rig_of, skin
+from datagen.bodies.skinning import Rest, remembering, rig_of, skin
 from datagen.common.assets import Asset
 from datagen.mesh.rig import Rig, drivers_of
 from datagen.poses import JOINTS, Poses
@@ -27,7 +27,7 @@ class LegModel:
     def __init__(self, recipe: LegBody) -> None:
         self._rings, self._segments = recipe.rings, recipe.segments
         self._faces = self._tube()
-        self._rest = kept(self._shaped)
+        self.rest = remembering(self._rest)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
@@ -52,15 +52,15 @@ class LegModel:
 
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32."""
-        rest = self._rest(parameters)
+        rest = self.rest(parameters)
         return skin(rest, poses.on(_BONES, rest.parents))
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """Thigh and shin; where they blend depends on the identity, so that each has weights of its own."""
-        rest = self._rest(parameters)
+        rest = self.rest(parameters)
         return rig_of(rest, _BONES, drivers_of(_BONES, rest.parents, joints))
 
-    def _shaped(self, parameters: NDArray[np.float64]) -> Rest:
+    def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters
         along = np.linspace(0.0, 1.0, self._rings)
         angle = np.linspace(0.0, 2 * np.pi, self._segments, endpoint=False)

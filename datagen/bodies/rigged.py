@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies.proportions import Scales, Stretchable
-from datagen.bodies.skinning import Rest, kept, rig_of, skin
+from datagen.bodies.skinning import Rest, remembering, rig_of, skin
 from datagen.characters.character import load_characters, shared_joints
 from datagen.characters.weld import volume
 from datagen.common.errors import BodyError
@@ -41,7 +41,7 @@ class RiggedModel:
         self.joints = shared_joints(self._characters)[0]
         self.assets = tuple(dict.fromkeys(asset for character in self._characters for asset in character.assets))
         self._range, self._height = recipe.bone_scale, recipe.height
-        self._rest = kept(self._stretched)
+        self.rest = remembering(self._rest)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """The character's number, then factors uniform within 1 +- the recipe's ``bone_scale``."""
@@ -56,15 +56,15 @@ class RiggedModel:
     def vertices(self, parameters: NDArray[np.float64], poses: Poses) -> NDArray[np.float32]:
         """Vertices [pose, vertex, 3] float32; the root joint stays where it is at rest (no grounding)."""
         character = self._characters[int(parameters[0])]
-        return skin(self._rest(parameters), poses.on(character.names, character.parents))
+        return skin(self.rest(parameters), poses.on(character.names, character.parents))
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """The joints of the identity's character; those that the poses do not turn are one part with their parents."""
         character = self._characters[int(parameters[0])]
         drivers = drivers_of(character.names, character.parents, joints)
-        return rig_of(self._rest(parameters), character.names, drivers)
+        return rig_of(self.rest(parameters), character.names, drivers)
 
-    def _stretched(self, parameters: NDArray[np.float64]) -> Rest:
+    def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         number = int(parameters[0])
         character = self._characters[number]
         factors = dict(zip(self.parameter_names[1:], parameters[1:].tolist(), strict=True))

@@ -59,9 +59,11 @@ class _Prepared:
     fine: float
 
 
-def kept(rest: Callable[[NDArray[np.float64]], Rest]) -> Callable[[NDArray[np.float64]], Rest]:
-    """Let a body's function from parameters to rest remember its last identities: tasks ask for few poses at once."""
-    last = lru_cache(maxsize=4)(lambda values: rest(np.array(values)))
+def remembering(rest: Callable[[NDArray[np.float64]], Rest]) -> Callable[[NDArray[np.float64]], Rest]:
+    """The same function from parameters to rest, which remembers its last identity: a task asks for few of its poses at
+    a time. Nobody may change what it returns.
+    """
+    last = lru_cache(maxsize=1)(lambda values: rest(np.array(values)))
     return lambda parameters: last(tuple(parameters.tolist()))
 
 
@@ -79,9 +81,9 @@ def skin(rest: Rest, world: NDArray[np.float64], correctives: NDArray[np.float64
     """
     body, world, count = rest.prepared, _round(world, _COARSE), len(rest.vertices)
     posed = np.empty((len(world), count, 3), np.float32)
-    at_once = VERTICES_AT_ONCE // max(1, count)
+    at_once = VERTICES_AT_ONCE // count
     if isinstance(body.factors, np.ndarray):
-        at_once = min(at_once, _ONE_THREAD // max(1, 3 * body.factors.size))
+        at_once = min(at_once, _ONE_THREAD // (3 * body.factors.size))
     at_once = max(1, at_once)
     for first in range(0, len(world), at_once):
         some = slice(first, first + at_once)

@@ -60,7 +60,7 @@ def resolve_within(folder: Path, name: str) -> Path:
 def files_below(folder: Path | str, *, but: str | None = None) -> Iterator["os.DirEntry[str]"]:
     """Every file below a folder, links to files among them, in no order; no link to a folder is followed.
 
-    What is not there, or may not be looked into, holds none; so do folders whose path ends as ``but`` says.
+    What is not there, or may not be looked into, holds none; folders whose path ends in ``but`` are not looked into.
     """
     with suppress(FileNotFoundError, NotADirectoryError, PermissionError), os.scandir(folder) as entries:
         for entry in entries:

@@ -217,7 +217,7 @@ def _make_missing(
         results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
-    finish(url, recipe, rows, before=before.sizes if before else ())
+    finish(url, recipe, rows)
 
 
 @contextmanager

@@ -43,14 +43,15 @@ def make_shard(recipe: DatasetRecipe, shard: Shard) -> Iterator[tuple[NDArray[np
     BodyError
         The body model gave other vertices than planned, vertices that are not finite, or a mesh without extent.
     """
-    body, recipe_of_poses = load_body(recipe.body), recipe.poses.model_dump_json()
+    body, poses = load_body(recipe.body), _poses(recipe.poses.model_dump_json(), shard.poses)
+    poses.world()  # once for all slices, whatever the identity
     at_once = max(1, VERTICES_AT_ONCE // shard.vertices)
     for identity in shard.identities:
         parameters = identity_parameters(recipe, body, identity)
         for first in range(0, len(shard.poses), at_once):
-            numbers = shard.poses[first : first + at_once]
-            vertices = body.vertices(parameters, _poses(recipe_of_poses, numbers))
-            yield vertices, _sound_bounds(shard, identity, parameters, numbers, vertices)
+            some = slice(first, first + at_once)
+            vertices = body.vertices(parameters, poses[some])
+            yield vertices, _sound_bounds(shard, identity, parameters, shard.poses[some], vertices)
 
 
 def _sound_bounds(

@@ -37,10 +37,13 @@ class Poses:
         return len(self.rotations)
 
     def __getitem__(self, poses: slice) -> "Poses":
-        return Poses(self.joints, self.parents, self.rotations[poses])
+        some = Poses(self.joints, self.parents, self.rotations[poses])
+        if "_world" in vars(self):
+            vars(some)["_world"] = self._world[poses]
+        return some
 
     def world(self) -> NDArray[np.float64]:
-        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes; kept, for the next identity."""
+        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes; kept, for slices, too."""
         return self._world
 
     @cached_property

@@ -80,9 +80,17 @@ class ShardCodec:
             Vertices [mesh, vertex, 3], identity by identity, some meshes at a time.
         identities, poses
             How many of each these are.
+
+        Raises
+        ------
+        ValueError
+            The meshes have other vertices, or are more or fewer.
         """
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
-        chunks = [compressor.encode(mesh) for some in meshes for mesh in np.ascontiguousarray(some, "<f4")]
+        flat = (np.ascontiguousarray(some, "<f4").reshape(-1, self.vertices, 3) for some in meshes)
+        chunks = [compressor.encode(mesh) for some in flat for mesh in some]
+        if len(chunks) != identities * poses:
+            raise ValueError(f"{len(chunks)} meshes instead of {identities} x {poses}")
         sizes = np.array([len(chunk) + _CHECKSUM.size for chunk in chunks], np.uint64)
         index = np.full((self.rows, 2), _NOTHING, "<u8")
         index[self.rows_of(identities, poses)] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)

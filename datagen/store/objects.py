@@ -73,7 +73,7 @@ class LocalObjects(LocalStore):
             yield path
 
     def paths(self, prefix: str = "", *, but: str | None = None) -> Iterator[str]:
-        """Paths of all files below a folder, but those below folders whose path ends so."""
+        """Paths of all files below a folder; folders whose path ends in ``but`` are not looked into."""
         for file in files_below(self.root / prefix.rstrip("/"), but=but):
             yield file.path.removeprefix(f"{self.root}/")
 
@@ -228,10 +228,10 @@ def list_objects(group: zarr.Group) -> list[str]:
 
 
 def list_leftovers(group: zarr.Group, shards: Iterable[str]) -> list[str]:
-    """Paths of what killed writers left beside these shards, and of all objects but shards."""
+    """Paths of what killed writers left, beside these shards and beside all objects that are none."""
     if isinstance(store := group.store, LocalObjects):
         beside = (store.paths(path.rpartition("/")[0]) for path in shards)
-        return [path for path in chain(store.paths(but=_SHARDS), *beside) if is_leftover(path)]
+        return [path for path in chain(store.paths(but=_SHARDS), chain.from_iterable(beside)) if is_leftover(path)]
     return [path for path in _paths(group) if is_leftover(path)]
 
 

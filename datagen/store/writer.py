@@ -363,10 +363,8 @@ def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
             put_so_far(group, so_far)
 
 
-def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, before: Collection[str] = ()) -> None:
+def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
     """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
-
-    ``before`` are the paths of shards of a complete dataset that this one grew from: nobody has written them since.
 
     Raises
     ------
@@ -385,7 +383,7 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, befo
         for row in rows:
             if sizes.get(row.path) != row.bytes:
                 raise DatasetError(f"{url}: shard {row.path} was changed by somebody else. Run the same command again")
-        for path in list_leftovers(group, [row.path for row in rows if row.path not in before]):
+        for path in list_leftovers(group, [row.path for row in rows]):
             delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None
         objects = manifest.objects if manifest else None

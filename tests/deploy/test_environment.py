@@ -29,6 +29,7 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
     monkeypatch.setattr(module.shutil, "which", lambda name: None)
     monkeypatch.setattr(module, "has_own_indexes", lambda python: False)
     monkeypatch.setattr(module, "cpu_index", lambda: "https://cpu.example")
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
     return module
 
 
@@ -105,3 +106,16 @@ def test_every_package_that_is_installed_runs_on_the_oldest_python_that_is_promi
     for package in importlib.metadata.distributions():
         needed = SpecifierSet(*(package.metadata.get_all("Requires-Python") or []))
         assert needed.contains("3.11.0"), f"{package.name} {package.version} needs Python {needed}: pin an older one"
+
+
+def test_packages_are_compiled_once_where_nothing_is_kept_later(
+    environment: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packages = Path(".venv/lib/python3.11/site-packages")
+    packages.mkdir(parents=True)
+    (packages / "sound.py").write_text("A = 1")
+    (packages / "template.py").write_text("{{ no Python }}")
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    environment.compile_packages(Path(sys.executable))
+    assert [path.name.split(".")[0] for path in packages.glob("__pycache__/*")] == ["sound"]
+    assert "compiling the packages" in capsys.readouterr().out

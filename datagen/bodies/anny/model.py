@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from datagen.bodies.anny.identities import Population, draw_local_changes, draw_uniform
 from datagen.bodies.anny.rigs import Bones, t_pose_corrections
 from datagen.bodies.anny.shape import AnnyShape
-from datagen.bodies.skinning import Rest, kept, rig_of, skin
+from datagen.bodies.skinning import Rest, remembering, rig_of, skin
 from datagen.common.assets import Asset
 from datagen.common.errors import BodyError
 from datagen.mesh.rig import Rig, drivers_of, part_transforms
@@ -57,7 +57,7 @@ class AnnyModel:
         heads = model.template_bone_heads.numpy()[self._bones.order]
         self._corrections = t_pose_corrections(self._bones, _y_up(heads))
         self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
-        self.rest = kept(self._rest)
+        self.rest = remembering(self._rest)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Phenotypes as the recipe's ``ages`` says, within its ranges, then local changes."""

@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.bodies.skinning import Rest, kept, skin
+from datagen.bodies.skinning import VERTICES_AT_ONCE, Rest, remembering, skin
 from datagen.bodies.smpl_family.model_file import ModelFile
 from datagen.common.errors import BodyError
 
-_POSES_AT_ONCE = 32  # bounds memory: pose blend shapes of 32 poses x 10,475 vertices x 3 x 8 bytes are 8 MB
 _STEPS = 2.0**20  # parameters, rotations: a step of a millionth
 _SHAPED_STEPS = 2.0**24  # metres at rest, from which joints are regressed: 60 nanometres
 _MANTISSA = 52
@@ -42,7 +41,7 @@ class LayoutBody:
         self._regressor = _exact_beside(file.regressor, largest=extent, steps=_SHAPED_STEPS, axis=1)
         by_feature = np.ascontiguousarray(file.posedirs.reshape(-1, file.posedirs.shape[-1]).T)
         self._posedirs = _exact_beside(by_feature, largest=2.0, steps=_STEPS, axis=0) if by_feature.any() else None
-        self.rest = kept(self._rest)
+        self.rest = remembering(self._rest)
 
     def _rest(self, betas: NDArray[np.float64]) -> Rest:
         """The identity of shape parameters [beta]: SMPL's equations 8 and 10, by the reference implementation."""
@@ -61,8 +60,9 @@ class LayoutBody:
         if self._posedirs is None:
             return skin(rest, world)
         posed = np.empty((len(world), len(rest.vertices), 3), np.float32)
-        for first in range(0, len(world), _POSES_AT_ONCE):
-            some = slice(first, first + _POSES_AT_ONCE)
+        at_once = max(1, VERTICES_AT_ONCE // len(rest.vertices))
+        for first in range(0, len(world), at_once):
+            some = slice(first, first + at_once)
             posed[some] = skin(rest, world[some], self.correctives(world[some]))
         return posed
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from datagen.bodies import load_body, skinning
-from datagen.bodies.skinning import Rest, skin
+from datagen.bodies.skinning import Rest, remembering, skin
 from datagen.common.seeding import Stream, generator
 from datagen.poses import draw_poses
-from datagen.recipe import AnnyBody, PoseRecipe
+from datagen.recipe import AnnyBody, LegBody, PoseRecipe
 
 PARENTS = (-1, 0, 1, 1)
 
@@ -60,6 +60,21 @@ def test_many_poses_are_what_single_ones_are(monkeypatch: pytest.MonkeyPatch) ->
     world = rotations(70)
     together = skin(rest(), world)
     assert all(np.array_equal(together[i : i + 1], skin(rest(), world[i : i + 1])) for i in (0, 31, 32, 69))
+
+
+def test_few_joints_are_skinned_alike_whatever_a_product_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, world = load_body(LegBody()), rotations(70)[:, :2]
+    legs = body.rest(body.draw_identity(np.random.default_rng(0), 0))  # type: ignore[attr-defined]
+    together = skin(legs, world)
+    monkeypatch.setattr(skinning, "_ONE_THREAD", 3 * 8 * len(legs.vertices) * 16)
+    assert np.array_equal(skin(legs, world), together)
+
+
+def test_a_body_remembers_the_last_identity_alone() -> None:
+    asked: list[float] = []
+    remembered = remembering(lambda parameters: asked.append(parameters[0]) or rest())  # type: ignore[func-returns-value]
+    found = [remembered(np.array([number])) for number in (1.0, 1.0, 2.0, 2.0, 1.0)]
+    assert asked == [1.0, 2.0, 1.0] and found[0] is found[1] and found[0] is not found[4]
 
 
 def test_errors_in_the_last_bits_of_its_input_do_not_show() -> None:

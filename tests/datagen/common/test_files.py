@@ -44,6 +44,8 @@ def test_files_below_a_folder_are_all_found_whatever_else_lies_there(tmp_path: P
         (tmp_path / "folder" / name).symlink_to(leads_to)
     found = {os.path.relpath(file.path, tmp_path / "folder") for file in files_below(tmp_path / "folder")}
     assert found == {"a", "b", "below/c", "to-file"}
+    assert {file.name for file in files_below(tmp_path / "folder", but="other/below")} == {"a", "b", "c", "to-file"}
+    assert {file.name for file in files_below(tmp_path / "folder", but="folder/below")} == {"a", "b", "to-file"}
     assert not list(files_below(tmp_path / "none")) and not list(files_below(tmp_path / "folder" / "a"))
 
 

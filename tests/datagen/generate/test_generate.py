@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from datagen import generate as generation
 from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import ensure_shards, generate, inline, make_shard, shards
+from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
 from datagen.store.manifest import commit
@@ -26,7 +27,7 @@ from datagen.store.objects import read_bytes, write_bytes
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
-from tests.support.recipes import shards_of, tiny_dataset, vertices_of
+from tests.support.recipes import mixed_dataset, shards_of, tiny_dataset, vertices_of
 
 
 class Interrupted(Exception):
@@ -86,6 +87,15 @@ def test_meshes_made_few_at_a_time_give_the_same_bytes(
     assert tree_hash(generate(tiny_dataset(), str(tmp_path / "leg.zarr")).url) == tree_hash(dataset)
 
 
+@pytest.mark.parametrize("recipe", [tiny_dataset(store={"poses_per_shard": 20}), mixed_dataset()])
+def test_blocks_do_not_show_where_shards_hold_several_identities_or_topologies_differ(
+    recipe: DatasetRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = generate(recipe, str(tmp_path / "whole.zarr")).url
+    monkeypatch.setattr(shards, "VERTICES_AT_ONCE", 64)
+    assert tree_hash(generate(recipe, str(tmp_path / "blocks.zarr")).url) == tree_hash(whole)
+
+
 def test_two_generators_on_one_dataset(tmp_path: Path) -> None:
     url = str(tmp_path / "leg.zarr")
     with writing_alone(url), pytest.raises(DatasetError, match="another process is writing to"):
@@ -98,8 +108,8 @@ def test_two_generators_on_a_store_without_a_lock(dataset: str, monkeypatch: pyt
     """One that has begun meanwhile writes its empty manifest over the finished one's, with or without the root."""
     url, real, seen = f"memory://{uuid4().hex}.zarr", generation.finish, list[DatasetError]()
 
-    def finish(*given: Any, **named: Any) -> None:
-        real(*given, **named)
+    def finish(*given: Any) -> None:
+        real(*given)
         if not seen:
             group = open_group(url, mode="r+")
             root = read_bytes(group, "zarr.json") or b""

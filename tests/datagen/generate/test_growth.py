@@ -89,6 +89,32 @@ def test_interrupted_it_goes_on_with_the_same_call(spoilable: Path, tmp_path: Pa
     assert tree_hash(spoilable) == tree_hash(other)
 
 
+def test_what_killed_writers_left_goes_with_an_append(spoilable: Path, tmp_path: Path) -> None:
+    """Beside shards that were there, as a killed repair leaves it, beside new ones and beside anything else."""
+    other = tmp_path / "undisturbed.zarr"
+    shutil.copytree(spoilable, other)
+    append(str(other), training=4)
+    beside = ["grid/training/0/vertices/c/1/0/0/0", "grid/training/0/identity/c/0", "zarr"]
+    for path in beside:
+        (spoilable / f"{path}.1234abcd.partial").write_bytes(b"half")
+
+    def killed(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
+        if task is not ensure_shards:
+            yield from inline(task, arguments)
+            return
+        for url, _, some in arguments:
+            for shard, _ in some:
+                left = Path(url) / f"{shard.path}.1234abcd.partial"
+                left.parent.mkdir(parents=True, exist_ok=True)
+                left.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        append(str(spoilable), training=4, run=killed)
+    append(str(spoilable), training=4)
+    assert tree_hash(spoilable) == tree_hash(other)
+
+
 def test_fewer_than_there_are_is_refused(spoilable: Path) -> None:
     before = tree_hash(spoilable)
     with pytest.raises(DatasetError, match=r"has 3 training, more than 2; appending does not take away"):

@@ -78,6 +78,12 @@ def test_spoiled_bytes_are_never_wrong_meshes(place: int, how: str) -> None:
         codec.decode(bytes(content), codec.rows_of(2, 2))
 
 
+@pytest.mark.parametrize("made", [(1, 3, 30), (1, 5, 30), (1, 1, 30), (1, 4, 31)])
+def test_other_meshes_than_there_are_cells_for_are_not_encoded(made: tuple[int, int, int]) -> None:
+    with pytest.raises(ValueError, match=r"meshes instead of 1 x 4|cannot reshape"):
+        ShardCodec(1, 5, 30, "lz4", 5).encode(meshes(*made), 1, 4)
+
+
 def test_a_row_that_is_not_there() -> None:
     codec = ShardCodec(1, 5, 30, "lz4", 5)
     with pytest.raises(ShardDamage, match="row 4 is empty"):
