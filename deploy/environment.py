@@ -50,7 +50,7 @@ def main() -> int:
 
 def compile_packages(python: Path) -> None:
     """Compile them once, where PYTHONDONTWRITEBYTECODE is set as in some containers; each command would, else."""
-    say("compiling the packages, half a minute: Python is told to keep nothing of what it compiles later")
+    say("compiling the packages, a minute or less: Python is told to keep nothing of what it compiles later")
     packages = next((VENV / "lib").glob("python3*/site-packages"))
     command = [str(python), "-m", "compileall", "-q", "-q", "-j", "0", str(packages)]
     subprocess.run(command, check=False)  # some hold templates, and code for other versions of Python

@@ -85,8 +85,8 @@ def measure(topology: str, folder: Path) -> None:
     """Measure and print one topology's table."""
     recipe, url = recipe_of(topology), str(folder / f"{topology}.zarr")
     body = load_body(recipe.body)
-    people = [body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, n), n) for n in range(ROUNDS + 1)]
-    parameters = people[0]
+    drawn = (body.draw_identity(generator(recipe.identities.seed, Stream.IDENTITY, n), n) for n in range(ROUNDS + 2))
+    parameters, *people = drawn
     poses, faces = draw_poses(recipe.poses, range(POSES)), body.faces(parameters)
     shards = prepare(url, recipe).shards()
     forward = annys_own_forward(topology)

@@ -43,7 +43,7 @@ class Poses:
         return some
 
     def world(self) -> NDArray[np.float64]:
-        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes; kept, for slices, too."""
+        """Rotations [pose, joint, 3, 3] of the joints relative to rest, in world axes; kept, and shared by slices."""
         return self._world
 
     @cached_property

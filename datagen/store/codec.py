@@ -84,17 +84,22 @@ class ShardCodec:
         Raises
         ------
         ValueError
-            The meshes have other vertices, or are more or fewer.
+            The meshes have other vertices, are more or fewer, or more than a shard has room for.
         """
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
-        flat = (np.ascontiguousarray(some, "<f4").reshape(-1, self.vertices, 3) for some in meshes)
-        chunks = [compressor.encode(mesh) for some in flat for mesh in some]
-        if len(chunks) != identities * poses:
-            raise ValueError(f"{len(chunks)} meshes instead of {identities} x {poses}")
+        chunks = [compressor.encode(mesh) for some in meshes for mesh in self._checked(some)]
+        if len(chunks) != identities * poses or identities > self.identities or poses > self.poses:
+            room = f"with room for {self.identities} x {self.poses}"
+            raise ValueError(f"{len(chunks)} meshes instead of {identities} x {poses}, {room}")
         sizes = np.array([len(chunk) + _CHECKSUM.size for chunk in chunks], np.uint64)
         index = np.full((self.rows, 2), _NOTHING, "<u8")
         index[self.rows_of(identities, poses)] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)
         return b"".join(part for chunk in (*chunks, index.tobytes()) for part in (chunk, _checksum(chunk)))
+
+    def _checked(self, meshes: NDArray[np.float32]) -> NDArray[np.float32]:
+        if meshes.shape[1:] != (self.vertices, 3):
+            raise ValueError(f"meshes of shape {meshes.shape[1:]} instead of {(self.vertices, 3)}")
+        return np.ascontiguousarray(meshes, "<f4")
 
     def decode(self, file: bytes, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """The meshes [row, vertex, 3] of some rows of a file.

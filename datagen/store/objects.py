@@ -228,7 +228,7 @@ def list_objects(group: zarr.Group) -> list[str]:
 
 
 def list_leftovers(group: zarr.Group, shards: Iterable[str]) -> list[str]:
-    """Paths of what killed writers left, beside these shards and beside all objects that are none."""
+    """Paths of what killed writers left, beside these shards and beside all that is no shard."""
     if isinstance(store := group.store, LocalObjects):
         beside = (store.paths(path.rpartition("/")[0]) for path in shards)
         return [path for path in chain(store.paths(but=_SHARDS), chain.from_iterable(beside)) if is_leftover(path)]

@@ -84,9 +84,14 @@ def test_what_is_fetched_is_said_every_few_seconds(environment: ModuleType, caps
     assert "2 files of 2 MB fetched, 0 installed: installing 3 packages" in said
 
 
+@pytest.mark.parametrize("keeps_nothing", [False, True])
 @pytest.mark.parametrize("status", [0, 3])
 def test_an_environment_is_ready_only_when_all_was_installed(
-    status: int, environment: ModuleType, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    status: int,
+    keeps_nothing: bool,
+    environment: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     command = [sys.executable, "-c", f"print('No matching distribution'); raise SystemExit({status})"]
     monkeypatch.setattr(
@@ -94,8 +99,12 @@ def test_an_environment_is_ready_only_when_all_was_installed(
     )  # no venv is made
     monkeypatch.setattr(environment, "installer", lambda python: command)
     monkeypatch.setattr(environment, "by_pip", lambda python: command)
+    compiled: list[Path] = []
+    monkeypatch.setattr(sys, "dont_write_bytecode", keeps_nothing)
+    monkeypatch.setattr(environment, "compile_packages", compiled.append)
     Path(".venv").mkdir()
     assert environment.main() == status
+    assert compiled == ([PYTHON] if keeps_nothing and status == 0 else [])
     assert (Path(".venv") / ".ready").exists() is (status == 0)
     shown = capfd.readouterr()
     assert ("No matching distribution" in shown.err) is (status == 3)

@@ -62,7 +62,7 @@ def test_many_poses_are_what_single_ones_are(monkeypatch: pytest.MonkeyPatch) ->
     assert all(np.array_equal(together[i : i + 1], skin(rest(), world[i : i + 1])) for i in (0, 31, 32, 69))
 
 
-def test_few_joints_are_skinned_alike_whatever_a_product_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_joints_are_skinned_alike_however_many_poses_a_product_has(monkeypatch: pytest.MonkeyPatch) -> None:
     body, world = load_body(LegBody()), rotations(70)[:, :2]
     legs = body.rest(body.draw_identity(np.random.default_rng(0), 0))  # type: ignore[attr-defined]
     together = skin(legs, world)

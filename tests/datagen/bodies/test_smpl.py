@@ -13,6 +13,7 @@ from smplx.utils import Struct
 from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
+from datagen.bodies.smpl_family import blend_shapes
 from datagen.bodies.smpl_family.blend_shapes import LayoutBody
 from datagen.bodies.smpl_family.model_file import read_model
 from datagen.bodies.smpl_family.model_search import find_model
@@ -114,7 +115,9 @@ def test_joint_names_and_trees_agree(model: str) -> None:
     assert names[:22] == JOINTS[:22] and tuple(arrays["kintree_table"][0]) == tree(model)
 
 
-def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(tmp_path: Path) -> None:
+def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every sum is exact: any order of the pose blend shapes' and the shapes' terms gives the same bits."""
     file = read_model(save_npz(tmp_path / "m.npz", arrays_of("smpl")))
     body, world = LayoutBody(file, betas=10, reach=4), NPT.on(JOINTS, PARENTS)
@@ -123,6 +126,8 @@ def test_bytes_do_not_depend_on_batches_threads_or_the_order_of_sums(tmp_path: P
         whole = body.vertices(betas, world)
     with threadpool_limits(1):
         assert np.array_equal(whole[17], body.vertices(betas, world[17:18])[0])
+    monkeypatch.setattr(blend_shapes, "VERTICES_AT_ONCE", 7 * len(file.template))
+    assert np.array_equal(whole, body.vertices(betas, world)) and len(world) % 7
     shuffled = np.random.default_rng(1).permutation(10)
     other = LayoutBody(replace(file, shapedirs=file.shapedirs[..., shuffled]), betas=10, reach=4)
     assert np.array_equal(whole, other.vertices(betas[shuffled], world))

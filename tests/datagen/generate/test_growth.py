@@ -89,8 +89,17 @@ def test_interrupted_it_goes_on_with_the_same_call(spoilable: Path, tmp_path: Pa
     assert tree_hash(spoilable) == tree_hash(other)
 
 
-def test_what_killed_writers_left_goes_with_an_append(spoilable: Path, tmp_path: Path) -> None:
-    """Beside shards that were there, as a killed repair leaves it, beside new ones and beside anything else."""
+def test_what_a_killed_repair_left_beside_an_old_shard_goes_with_an_append(spoilable: Path, tmp_path: Path) -> None:
+    other = tmp_path / "undisturbed.zarr"
+    shutil.copytree(spoilable, other)
+    append(str(other), training=4)
+    (spoilable / "grid/training/0/vertices/c/1/0/0/0.1234abcd.partial").write_bytes(b"half")
+    append(str(spoilable), training=4)
+    assert tree_hash(spoilable) == tree_hash(other)
+
+
+def test_what_killed_writers_left_goes_with_an_append_that_is_given_again(spoilable: Path, tmp_path: Path) -> None:
+    """Beside shards that were there, beside new ones and beside anything else."""
     other = tmp_path / "undisturbed.zarr"
     shutil.copytree(spoilable, other)
     append(str(other), training=4)

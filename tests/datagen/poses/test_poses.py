@@ -72,6 +72,13 @@ def test_a_pose_is_a_function_of_seed_and_number_alone() -> None:
     assert not np.array_equal(small.draw(7), load_poses(PoseRecipe(seen=10, unseen=5, seed=1)).draw(7))
 
 
+def test_slices_share_the_world_rotations_that_are_known() -> None:
+    poses = draw_poses(PoseRecipe(seen=10, unseen=5), range(8))
+    before = poses[3:5].world()
+    assert np.array_equal(before, poses.world()[3:5]) and not np.shares_memory(before, poses.world())
+    assert np.shares_memory(poses[3:5].world(), poses.world()) and np.array_equal(poses[3:5].world(), before)
+
+
 def test_ranges_of_ones_own() -> None:
     knee = RangePoses(degrees={"left_knee": ((0, 90), (0, 0), (0, 0))})
     poses = draw_poses(PoseRecipe(distribution=knee), range(200)).rotations * DEGREES
