@@ -83,6 +83,10 @@ class ShardDamage(ValueError):
     """The bytes of a shard are not what was written."""
 
 
+class ShardMismatch(ValueError):
+    """Meshes are not those that a shard is to hold: of other vertices, more or fewer."""
+
+
 class NoDataset(DatasetError):
     """There is nothing at that place."""
 

@@ -38,7 +38,7 @@ class Poses:
 
     def __getitem__(self, poses: slice) -> "Poses":
         some = Poses(self.joints, self.parents, self.rotations[poses])
-        if "_world" in vars(self):
+        if "_world" in vars(self):  # worked out for all of them, so for these
             vars(some)["_world"] = self._world[poses]
         return some
 

@@ -19,7 +19,7 @@ import numpy as np
 from numcodecs import Blosc
 from numpy.typing import NDArray
 
-from datagen.common.errors import ShardDamage
+from datagen.common.errors import ShardDamage, ShardMismatch
 
 # Blosc's threads write their blocks in the order in which they finish; one thread makes the bytes reproducible.
 numcodecs.blosc.use_threads = False
@@ -83,14 +83,14 @@ class ShardCodec:
 
         Raises
         ------
-        ValueError
+        ShardMismatch
             The meshes have other vertices, are more or fewer, or more than a shard has room for.
         """
         compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
         chunks = [compressor.encode(mesh) for some in meshes for mesh in self._checked(some)]
         if len(chunks) != identities * poses or identities > self.identities or poses > self.poses:
             room = f"with room for {self.identities} x {self.poses}"
-            raise ValueError(f"{len(chunks)} meshes instead of {identities} x {poses}, {room}")
+            raise ShardMismatch(f"{len(chunks)} meshes instead of {identities} x {poses}, {room}")
         sizes = np.array([len(chunk) + _CHECKSUM.size for chunk in chunks], np.uint64)
         index = np.full((self.rows, 2), _NOTHING, "<u8")
         index[self.rows_of(identities, poses)] = np.stack([np.cumsum(sizes) - sizes, sizes], axis=1)
@@ -98,7 +98,7 @@ class ShardCodec:
 
     def _checked(self, meshes: NDArray[np.float32]) -> NDArray[np.float32]:
         if meshes.shape[1:] != (self.vertices, 3):
-            raise ValueError(f"meshes of shape {meshes.shape[1:]} instead of {(self.vertices, 3)}")
+            raise ShardMismatch(f"meshes of shape {meshes.shape[1:]} instead of {(self.vertices, 3)}")
         return np.ascontiguousarray(meshes, "<f4")
 
     def decode(self, file: bytes, rows: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -13,7 +13,15 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from datagen.common.errors import DatasetError, NoDataset, ShardDamage, StorageError, UnsafeFileError, storage_errors
+from datagen.common.errors import (
+    DatasetError,
+    NoDataset,
+    ShardDamage,
+    ShardMismatch,
+    StorageError,
+    UnsafeFileError,
+    storage_errors,
+)
 from datagen.grid import HOLE, Grid, GridArray, GridArrays, PoseType, Shard
 from datagen.mesh.geometry import Bounds
 from datagen.mesh.geometry import bounds as bounds_of
@@ -256,16 +264,15 @@ class ShardWriter:
         lows, highs = list[NDArray[np.float32]](), list[NDArray[np.float32]]()
 
         def looked_at() -> Iterator[NDArray[np.float32]]:
-            count = 0
             for vertices, (low, high) in meshes:
-                self._require_shape(shard, vertices.shape[1:], (shard.vertices, 3))
                 lows.append(low)
                 highs.append(high)
-                count += len(vertices)
                 yield vertices
-            self._require_shape(shard, (count,), (shard.rows,))
 
-        content = codec_of(self._recipe, shard).encode(looked_at(), len(shard.identities), len(shard.poses))
+        try:
+            content = codec_of(self._recipe, shard).encode(looked_at(), len(shard.identities), len(shard.poses))
+        except ShardMismatch as error:
+            raise DatasetError(f"{self._url}: shard {shard.path} came out with {error}") from error
         row = row_of(shard, content, (np.concatenate(lows), np.concatenate(highs)))
         if committed not in (None, row.sha256):
             raise DatasetError(
@@ -280,10 +287,6 @@ class ShardWriter:
                     f"{self._url}: shard {shard.path} is not there as it was written; is the storage sound?"
                 )
         return row
-
-    def _require_shape(self, shard: Shard, found: tuple[int, ...], wanted: tuple[int, ...]) -> None:
-        if found != wanted:
-            raise DatasetError(f"{self._url}: shard {shard.path} came out with meshes of shape {found}, not {wanted}")
 
 
 def existing_shard(group: zarr.Group, recipe: DatasetRecipe, shard: Shard) -> ManifestRow | None:

@@ -9,7 +9,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.common.errors import ShardDamage
+from datagen.common.errors import ShardDamage, ShardMismatch
 from datagen.grid import GridArray
 from datagen.store.arrays import vertices_metadata
 from datagen.store.codec import ShardCodec
@@ -80,13 +80,13 @@ def test_spoiled_bytes_are_never_wrong_meshes(place: int, how: str) -> None:
 
 @pytest.mark.parametrize("made", [(1, 3, 30), (1, 5, 30), (1, 1, 30), (1, 4, 31), (1, 8, 15), (1, 2, 60)])
 def test_other_meshes_than_there_are_cells_for_are_not_encoded(made: tuple[int, int, int]) -> None:
-    with pytest.raises(ValueError, match=r"meshes instead of 1 x 4|of shape .* instead of \(30, 3\)"):
+    with pytest.raises(ShardMismatch, match=r"meshes instead of 1 x 4|of shape .* instead of \(30, 3\)"):
         ShardCodec(1, 5, 30, "lz4", 5).encode(meshes(*made), 1, 4)
 
 
 @pytest.mark.parametrize("identities, poses", [(1, 6), (2, 5)])
 def test_more_than_a_shard_has_room_for_is_not_encoded(identities: int, poses: int) -> None:
-    with pytest.raises(ValueError, match="with room for 3 x 4"):
+    with pytest.raises(ShardMismatch, match="with room for 3 x 4"):
         ShardCodec(3, 4, 30, "lz4", 5).encode(meshes(identities, poses, 30), identities, poses)
 
 

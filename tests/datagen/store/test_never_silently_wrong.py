@@ -49,9 +49,9 @@ def test_vertices_that_are_in_no_face_are_kept(tmp_path: Path, monkeypatch: pyte
 
 def test_a_shard_of_another_shape_is_not_written(spoilable: Path) -> None:
     shard, before = shards_of(tiny_dataset())[0], tree_hash(spoilable)
-    for shape, fault in (((4, 31, 3), r"\(31, 3\), not \(32, 3\)"), ((3, 32, 3), r"\(3,\), not \(4,\)")):
+    for shape, fault in (((4, 31, 3), r"of shape \(31, 3\) instead of \(32, 3\)"), ((3, 32, 3), "instead of 1 x 4")):
         other = np.zeros(shape, np.float32)
-        with pytest.raises(DatasetError, match=rf"with meshes of shape {fault}"):
+        with pytest.raises(DatasetError, match=rf"came out with .*meshes {fault}"):
             ShardWriter(str(spoilable), tiny_dataset()).write(shard, [(other, bounds(other))])
     assert tree_hash(spoilable) == before
 
