@@ -86,20 +86,14 @@ class Grid:
         return [base, *recipe.growth]
 
     @cached_property
-    def _splits(self) -> list[Split]:
-        found: list[Split] = []
-        for step in self.steps:
-            found.extend("training" for _ in range(step.training))
-            found.extend("evaluation" for _ in range(step.evaluation))
-        return found
+    def _splits(self) -> NDArray[np.intp]:
+        """The number of the split [identity] of each."""
+        return _repeated([count for step in self.steps for count in (step.training, step.evaluation)])
 
     @cached_property
-    def _pose_types(self) -> list[PoseType]:
-        found: list[PoseType] = []
-        for step in self.steps:
-            found.extend("seen" for _ in range(step.seen))
-            found.extend("unseen" for _ in range(step.unseen))
-        return found
+    def _pose_types(self) -> NDArray[np.intp]:
+        """The number of the type [pose] of each."""
+        return _repeated([count for step in self.steps for count in (step.seen, step.unseen)])
 
     @property
     def identity_count(self) -> int:
@@ -111,19 +105,19 @@ class Grid:
 
     def split(self, identity: int) -> Split:
         """Which split identity number ``identity`` belongs to."""
-        return self._splits[identity]
+        return SPLITS[self._splits[identity]]
 
     def identities(self, split: Split) -> list[int]:
         """Identity numbers of a split."""
-        return [number for number, each in enumerate(self._splits) if each == split]
+        return np.flatnonzero(self._splits == SPLITS.index(split)).tolist()
 
     def pose_type(self, pose: int) -> PoseType:
         """Whether pose number ``pose`` occurs in training."""
-        return self._pose_types[pose]
+        return POSE_TYPES[self._pose_types[pose]]
 
     def poses(self, pose_type: PoseType) -> NDArray[np.int64]:
         """Pose numbers of a type, in order."""
-        return np.flatnonzero([each == pose_type for each in self._pose_types])
+        return np.flatnonzero(self._pose_types == POSE_TYPES.index(pose_type))
 
     def poses_of(self, identity: int) -> NDArray[np.int64]:
         """Pose numbers that this identity is made in, ascending."""
@@ -346,6 +340,11 @@ class GridArrays:
     def shards(self) -> list[Shard]:
         """All shards, ordered by place."""
         return [shard for array in self.arrays for shard in array.shards()]
+
+
+def _repeated(counts: Sequence[int]) -> NDArray[np.intp]:
+    """0 and 1 in turns, as often as ``counts`` says, which has two numbers for each step."""
+    return np.repeat(np.arange(len(counts)) % 2, counts)
 
 
 def _by_value(values: NDArray[np.int32]) -> list[tuple[int, NDArray[np.int64]]]:

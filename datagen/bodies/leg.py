@@ -22,11 +22,14 @@ class LegModel:
 
     parameter_names = tuple(_RANGES)
     joints = JOINTS  # all but two of which move nothing: it is one leg
-    assets = (Asset("procedural leg", "Apache-2.0", "1"),)
+    assets = (Asset("procedural leg", "Apache-2.0", "2"),)
 
     def __init__(self, recipe: LegBody) -> None:
         self._rings, self._segments = recipe.rings, recipe.segments
         self._faces = self._tube()
+        self._along = np.linspace(0.0, 1.0, self._rings)
+        shin = np.repeat(1 / (1 + np.exp((0.5 - self._along) * 40)), self._segments)
+        self._weights = np.stack([1 - shin, shin], axis=1)
         self.rest = remembering(self._rest)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
@@ -56,21 +59,20 @@ class LegModel:
         return skin(rest, poses.on(_BONES, rest.parents))
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
-        """Thigh and shin; where they blend depends on the identity, so that each has weights of its own."""
+        """Thigh and shin; half of the rings are above the knee, so that all legs share their weights."""
         rest = self.rest(parameters)
         return rig_of(rest, _BONES, drivers_of(_BONES, rest.parents, joints))
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters
-        along = np.linspace(0.0, 1.0, self._rings)
+        along = np.interp(self._along, [0.0, 0.5, 1.0], [0.0, knee, 1.0])
         angle = np.linspace(0.0, 2 * np.pi, self._segments, endpoint=False)
         radius = (thigh + (ankle - thigh) * along) * (1 + 0.15 * np.sin(np.pi * along) ** 2)
         x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle) + 0.02 * np.sin(np.pi * along)[:, None]
         y = np.broadcast_to(-length * along[:, None], x.shape)
-        shin = np.repeat(1 / (1 + np.exp((knee - along) * 40)), self._segments)
         return Rest(
             vertices=np.stack([x, y, z], axis=-1).reshape(-1, 3),
             joints=np.array([[0.0, 0.0, 0.0], [0.0, -length * knee, 0.0]]),
-            weights=np.stack([1 - shin, shin], axis=1),
+            weights=self._weights,
             parents=(-1, 0),
         )

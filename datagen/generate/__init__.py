@@ -210,14 +210,14 @@ def _make_missing(
         if row is not None and row.place in sound and row.rows == shard.rows:
             rows.append(doubted.pop(shard.place))
         else:
-            missing.append((shard, row.sha256 if row else None))
+            missing.append((shard, row.blake3 if row else None))
     tasks = [(url, recipe, some) for some in batches(recipe, missing)]
-    done = sum(row.rows for row in rows)
+    done, settled = sum(row.rows for row in rows), len(rows) if before else 0
     with closing(closable(run(ensure_shards, tasks))) as ran, _saving(url, recipe, rows, doubted) as add:
         results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
-    finish(url, recipe, rows)
+    finish(url, recipe, rows, settled=settled)
 
 
 @contextmanager

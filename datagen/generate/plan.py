@@ -28,7 +28,7 @@ READS_FOLDERS = ("imported", "mixed")
 """Families whose assets are whole folders: they are hashed once, when a dataset is begun, and not in every worker."""
 _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
 _CONTENT = 2
-"""The version of what a recipe means, part of the uuid: formats 2 and 3 hold the same meshes."""
+"""The version of what a recipe means, part of the uuid: formats 2 to 4 hold the same meshes."""
 _PACKAGES = ("anny", "smplx", "numpy", "scipy", "warp-lang", "zarr", "numcodecs")
 _BLOCK_SECONDS, _MOST_IN_BLOCK = 0.5, 1000
 """Of work in a task that describes identities or draws poses, and how many at most."""

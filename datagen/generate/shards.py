@@ -23,7 +23,7 @@ from datagen.store.schema import open_group
 from datagen.store.writer import ShardWriter, existing_shard
 
 Wanted = tuple[Shard, str | None]
-"""A shard, and its sha256 where the dataset has a manifest already: other bytes are neither kept nor written."""
+"""A shard, and its hash where the dataset has a manifest already: other bytes are neither kept nor written."""
 TASK_SECONDS, _FEWEST_TASKS = 0.5, 64
 """Of work in a task at most, and tasks at least: for many workers, and for progress that is seen."""
 
@@ -118,7 +118,7 @@ def ensure_shards(url: str, recipe: DatasetRecipe, shards: Sequence[Wanted]) -> 
 
 def _ensured(writer: ShardWriter, recipe: DatasetRecipe, shard: Shard, committed: str | None) -> ManifestRow:
     row = existing_shard(writer.group, recipe, shard)
-    if row is not None and committed in (None, row.sha256):
+    if row is not None and committed in (None, row.blake3):
         return row
     return writer.write(shard, make_shard(recipe, shard), committed=committed)
 

@@ -9,10 +9,12 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import zarr
+from blake3 import blake3
 from numpy.typing import NDArray
 
 from datagen.common.errors import UnsafeFileError, reason_of
@@ -28,13 +30,14 @@ _COLUMNS = {
     "place": ("int32", (4,), ("shard", "axis")),
     "rows": ("int32", (), ("shard",)),
     "bytes": ("int64", (), ("shard",)),
-    "sha256": ("uint8", (32,), ("shard", "byte")),
+    "blake3": ("uint8", (32,), ("shard", "byte")),
     "extent": ("float32", (2, 3), ("shard", "bound", "coordinate")),
 }
 """Arrays with a row for each shard: type, shape of a row, dimension names."""
 _MOST = 10**9
 """Of a number in a path."""
 _OBJECTS = "manifest/object_sha256"
+_PLACE = attrgetter("place")
 SO_FAR = "manifest/so_far"
 """The object that lists the shards of a dataset in the making; the manifest has it all."""
 _SO_FAR_ROW = np.dtype(
@@ -42,14 +45,14 @@ _SO_FAR_ROW = np.dtype(
 )
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class ManifestRow:
     """One shard: where it lies, how many meshes it holds, its bytes and their hash, and the extent of its meshes."""
 
     place: Place
     rows: int
     bytes: int
-    sha256: str
+    blake3: str
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
 
@@ -66,10 +69,15 @@ def row_of(shard: Shard, content: bytes, bounds: Bounds) -> ManifestRow:
         place=shard.place,
         rows=shard.rows,
         bytes=len(content),
-        sha256=hashlib.sha256(content).hexdigest(),
+        blake3=shard_hash(content),
         minimum=_triple(low.min(axis=0)),
         maximum=_triple(high.max(axis=0)),
     )
+
+
+def shard_hash(content: bytes) -> str:
+    """The hash of a shard's bytes: as strong as sha256, and in several times less time."""
+    return blake3(content).hexdigest()
 
 
 def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
@@ -96,8 +104,8 @@ class Manifest:
     def shards(self) -> list[ManifestRow]:
         """One row a shard."""
         return [
-            ManifestRow(tuple(place), rows, size, bytes(sha256).hex(), tuple(low), tuple(high))
-            for place, rows, size, sha256, (low, high) in zip(
+            ManifestRow(tuple(place), rows, size, bytes(digest).hex(), tuple(low), tuple(high))
+            for place, rows, size, digest, (low, high) in zip(
                 *(self.columns[name].tolist() for name in _COLUMNS), strict=True
             )
         ]
@@ -123,12 +131,12 @@ class Manifest:
 
 def manifest_of(rows: Sequence[ManifestRow], objects: Mapping[str, str]) -> Manifest:
     """The manifest of these shards, in any order, and objects."""
-    ordered = sorted(rows)
+    ordered = sorted(rows, key=_PLACE)
     columns: dict[str, Any] = {
         "place": [row.place for row in ordered],
         "rows": [row.rows for row in ordered],
         "bytes": [row.bytes for row in ordered],
-        "sha256": _hashes(row.sha256 for row in ordered),
+        "blake3": _hashes(row.blake3 for row in ordered),
         "extent": [(row.minimum, row.maximum) for row in ordered],
     }
     types = _COLUMNS.items()
@@ -158,7 +166,7 @@ class SoFar:
 def put_so_far(group: zarr.Group, so_far: SoFar) -> None:
     """Keep it as one object, whole or not at all, while the manifest stays what was committed."""
     sound = {row.place for row in so_far.sound}
-    ordered = sorted([*so_far.sound, *so_far.doubted])
+    ordered = sorted([*so_far.sound, *so_far.doubted], key=_PLACE)
     table = np.zeros(len(ordered), _SO_FAR_ROW)
     table["sound"] = [row.place in sound for row in ordered]
     for name, values in manifest_of(ordered, {}).columns.items():
@@ -287,7 +295,7 @@ def changed_objects(group: zarr.Group, manifest: Manifest) -> Iterator[tuple[str
         if content is None:
             yield path, "missing"
         elif _sha256(content) != digest:
-            yield path, "its sha256 is not the manifest's"
+            yield path, "its hash is not the manifest's"
 
 
 def _hashed_objects(group: zarr.Group) -> list[str]:

@@ -21,7 +21,7 @@ _MEMBER = re.compile(
     |rig/{_NUMBER}/(?:zarr\.json|(?:weights|kind|joints|corrections)/zarr\.json|kind/c/0
         |(?:weights|joints|corrections)/c/0/0/0)
     |manifest/(?:rows|bytes)/(?:zarr\.json|c/0)
-    |manifest/(?:place|sha256|object_sha256)/(?:zarr\.json|c/0/0)
+    |manifest/(?:place|blake3|object_sha256)/(?:zarr\.json|c/0/0)
     |manifest/extent/(?:zarr\.json|c/0/0/0)
     |manifest/so_far""",
     re.VERBOSE,

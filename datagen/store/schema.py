@@ -14,7 +14,7 @@ NAME.zarr                        status building|complete, recipe, splits, prove
   rig/R/kind, joints             (identity of R,) int32, the weights of each; (identity of R, part, 3) float32, at rest
   rig/R/corrections              (part, 3, 3) float64, from the body's rest to that of the poses
   evaluation/seen, /unseen       (triple, 4) int32: source identity, source pose, target identity, target pose
-  manifest/place, rows, bytes, sha256, extent, object_sha256; committed last
+  manifest/place, rows, bytes, blake3, extent, object_sha256; committed last
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.codec import LARGEST_CHUNK, ShardCodec
 from datagen.store.objects import Objects, open_objects
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 OLDEST_RECIPE = 2
 """The format whose recipes are still understood, so that its datasets can be made anew."""
 _MOST_IDENTITIES = 1_000_000

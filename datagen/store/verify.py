@@ -1,6 +1,5 @@
 """Finding every fault of a dataset, and describing one at any status."""
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,12 +9,21 @@ import numpy as np
 import zarr
 
 from datagen.common.errors import DatasetError, UnsafeFileError, reason_of
-from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays, Shard
+from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays, Shard, shard_path
 from datagen.mesh.parts import part_name
 from datagen.recipe import DatasetRecipe, MixedBody
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.attributes import attributes_fault
-from datagen.store.manifest import Manifest, ManifestRow, changed_objects, covers, is_sealed, manifest_of, read_manifest
+from datagen.store.manifest import (
+    Manifest,
+    ManifestRow,
+    changed_objects,
+    covers,
+    is_sealed,
+    manifest_of,
+    read_manifest,
+    shard_hash,
+)
 from datagen.store.objects import read_bytes, stored_sizes
 from datagen.store.reader import Dataset, damage_of
 from datagen.store.schema import OLDEST_RECIPE, attributes_of, check_version, open_group, stored_recipe
@@ -87,8 +95,8 @@ def _committed(group: zarr.Group, row: ManifestRow) -> tuple[bytes | None, str |
         return None, "missing"
     if len(content) != row.bytes:
         return None, f"{len(content)} bytes instead of {row.bytes}"
-    if hashlib.sha256(content).hexdigest() != row.sha256:
-        return None, "its sha256 is not the manifest's"
+    if shard_hash(content) != row.blake3:
+        return None, "its hash is not the manifest's"
     return content, None
 
 
@@ -123,8 +131,11 @@ def _misfits(dataset: Dataset) -> Iterator[Fault]:
     yield from dict.fromkeys(Fault(damage.path, damage.reason) for damage in found if damage)
 
 
-def describe(url: str) -> dict[str, Any]:
-    """What a person wants to know of a dataset, at any status: grid, progress, sizes, provenance."""
+def describe(url: str, *, written: Mapping[str, int] | None = None) -> dict[str, Any]:
+    """What a person wants to know of a dataset, at any status: grid, progress, sizes, provenance.
+
+    ``written`` are the sizes of the shards that are there by their paths, where they are known.
+    """
     group = open_group(url)
     check_version(url, group)
     fault = attributes_fault(group)
@@ -133,8 +144,8 @@ def describe(url: str) -> dict[str, Any]:
     attributes, recipe = attributes_of(group), stored_recipe(url, group)
     dataset = Dataset(url, group)
     grid, arrays = Grid(recipe), _arrays(dataset)
-    shards = arrays.shards() if arrays else []
-    sizes = stored_sizes(group, [shard.path for shard in shards])
+    places = arrays.places()[0].tolist() if arrays else []
+    sizes = stored_sizes(group, [shard_path(place) for place in places]) if written is None else written
     facts = {
         "dataset": url,
         "status": attributes["status"],
@@ -147,7 +158,7 @@ def describe(url: str) -> dict[str, Any]:
         "clothes": _clothes(dataset, arrays),
         "appended": _growth(recipe),
         "meshes": f"{grid.mesh_count:,} of {_vertex_counts(arrays)} vertices",
-        "shards": f"{len(sizes)} of {len(shards)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
+        "shards": f"{len(sizes)} of {len(places)} written, {sum(sizes.values()) / 1e6:,.1f} MB",
         "extent": _extent(attributes),
         "evaluation triples": ", ".join(f"{_triples(group, kind)} {kind}" for kind in POSE_TYPES),
         "assets": _assets(attributes["body"]["assets"]),

@@ -253,7 +253,7 @@ class ShardWriter:
         meshes
             Vertices [mesh, vertex, 3] and bounds of its rows, in order, some at a time.
         committed
-            The sha256 that the dataset's manifest has of it, if any.
+            The hash that the dataset's manifest has of it, if any.
 
         Raises
         ------
@@ -274,7 +274,7 @@ class ShardWriter:
         except ShardMismatch as error:
             raise DatasetError(f"{self._url}: shard {shard.path} came out with {error}") from error
         row = row_of(shard, content, (np.concatenate(lows), np.concatenate(highs)))
-        if committed not in (None, row.sha256):
+        if committed not in (None, row.blake3):
             raise DatasetError(
                 f"{self._url}: shard {shard.path} was made again, but not the same: other package versions made it "
                 f"(dsffnet inspect {self._url} names them). Install those, or make the dataset anew with --fresh"
@@ -366,8 +366,14 @@ def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
             put_so_far(group, so_far)
 
 
-def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None:
+def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, settled: int = 0) -> None:
     """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
+
+    Parameters
+    ----------
+    settled
+        How many of the first rows are of the complete dataset that this one grew from, which was opened, and so looked
+        at, as this began.
 
     Raises
     ------
@@ -382,11 +388,12 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow]) -> None
     }
     with _writing(url):
         group = ShardWriter(url, recipe).group
-        sizes = stored_sizes(group, [row.path for row in rows])
-        for row in rows:
+        written = rows[settled:]
+        sizes = stored_sizes(group, [row.path for row in written])
+        for row in written:
             if sizes.get(row.path) != row.bytes:
                 raise DatasetError(f"{url}: shard {row.path} was changed by somebody else. Run the same command again")
-        for path in list_leftovers(group, [row.path for row in rows]):
+        for path in list_leftovers(group, [row.path for row in written]):
             delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None
         objects = manifest.objects if manifest else None

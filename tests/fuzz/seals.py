@@ -10,6 +10,7 @@ import numpy as np
 
 from datagen.common.errors import DsffnetError
 from datagen.grid import shard_path
+from datagen.store.manifest import shard_hash
 from tests.support.damage.datasets import sealed
 
 _LARGEST = 2**24  # bytes of a file that is looked into
@@ -28,7 +29,7 @@ def reseal_dataset(root: Path) -> None:
             if is_plain(root / shard_path(place)):
                 content = _read(root / shard_path(place))
                 manifest["bytes"][row] = len(content)
-                manifest["sha256"][row] = np.frombuffer(hashlib.sha256(content).digest(), np.uint8)
+                manifest["blake3"][row] = np.frombuffer(bytes.fromhex(shard_hash(content)), np.uint8)
 
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError, DsffnetError):
         sealed(root, manifest=with_shards)

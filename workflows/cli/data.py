@@ -21,6 +21,7 @@ from workflows.pipeline.console import print_facts, print_text
 
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
+    from datagen.store import Dataset
 
 
 def declare_generate(made: Parser) -> None:
@@ -120,8 +121,8 @@ def generate_command(options: argparse.Namespace) -> None:
 
     recipe = load_recipe(options.recipe, options.set).data
     with _runner(options, recipe, anew=options.fresh) as how:
-        generate(recipe, options.out, fresh=options.fresh, **how)
-    _show(options.out)
+        made = generate(recipe, options.out, fresh=options.fresh, **how)
+    _show(made)
 
 
 def append_command(options: argparse.Namespace) -> None:
@@ -140,8 +141,8 @@ def append_command(options: argparse.Namespace) -> None:
     recipe = _own_recipe(options.out, options.set)
     grown = grown_recipe(options.out, recipe, totals)
     with _runner(options, grown, anew=grown != recipe) as how:
-        append(options.out, **totals, recipe=recipe, **how)
-    _show(options.out)
+        made = append(options.out, **totals, recipe=recipe, **how)
+    _show(made)
 
 
 def inspect_command(options: argparse.Namespace) -> None:
@@ -239,8 +240,8 @@ def import_command(options: argparse.Namespace) -> None:
     base = {"data": found.model_dump(mode="json")}
     recipe = change_recipe(base, options.set, where=f"import {options.layout}").data
     with _runner(options, recipe, anew=options.fresh) as how:
-        generate(recipe, options.out, fresh=options.fresh, **how)
-    _show(options.out)
+        made = generate(recipe, options.out, fresh=options.fresh, **how)
+    _show(made)
 
 
 def _body_options(overrides: Sequence[str]) -> dict[str, Any]:
@@ -340,10 +341,10 @@ def _runner(options: argparse.Namespace, recipe: "DatasetRecipe", *, anew: bool)
         yield {"run": tasks.make_shards, "progress": generation_bar}
 
 
-def _show(url: str) -> None:
+def _show(made: "Dataset") -> None:
     from datagen.store.verify import describe
 
-    print_facts(describe(url))
+    print_facts(describe(made.url, written=made.sizes))
 
 
 COMMANDS = (

@@ -236,7 +236,7 @@ def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, mon
 def test_appending_refuses_what_changed_since_it_was_committed(spoilable: Path) -> None:
     flip_bit(spoilable / "rig/0/joints/c/0/0/0")
     before = tree_hash(spoilable)
-    with pytest.raises(DatasetError, match=r"rig/0/joints/c/0/0/0: its sha256 .*verify .* --repair"):
+    with pytest.raises(DatasetError, match=r"rig/0/joints/c/0/0/0: its hash .*verify .* --repair"):
         append(str(spoilable), training=4)
     assert tree_hash(spoilable) == before
 

@@ -108,8 +108,8 @@ def test_two_generators_on_a_store_without_a_lock(dataset: str, monkeypatch: pyt
     """One that has begun meanwhile writes its empty manifest over the finished one's, with or without the root."""
     url, real, seen = f"memory://{uuid4().hex}.zarr", generation.finish, list[DatasetError]()
 
-    def finish(*given: Any) -> None:
-        real(*given)
+    def finish(*given: Any, **how: Any) -> None:
+        real(*given, **how)
         if not seen:
             group = open_group(url, mode="r+")
             root = read_bytes(group, "zarr.json") or b""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datagen.common.errors import DatasetError
-from datagen.generate import append, ensure_shards, generate, inline
+from datagen.generate import append, ensure_shards, generate, inline, repair
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
@@ -89,12 +89,18 @@ def test_interrupted_it_goes_on_with_the_same_call(spoilable: Path, tmp_path: Pa
     assert tree_hash(spoilable) == tree_hash(other)
 
 
-def test_what_a_killed_repair_left_beside_an_old_shard_goes_with_an_append(spoilable: Path, tmp_path: Path) -> None:
+def test_what_a_killed_repair_left_beside_an_old_shard_goes_with_the_repair_that_is_given_again(
+    spoilable: Path, tmp_path: Path
+) -> None:
+    """An append does not look at shards that were there; the one that was being repaired is faulty still."""
     other = tmp_path / "undisturbed.zarr"
     shutil.copytree(spoilable, other)
     append(str(other), training=4)
-    (spoilable / "grid/training/0/vertices/c/1/0/0/0.1234abcd.partial").write_bytes(b"half")
+    shard = spoilable / "grid/training/0/vertices/c/1/0/0/0"
+    shard.write_bytes(bytes(shard.stat().st_size))
+    shard.with_name("0.1234abcd.partial").write_bytes(b"half")
     append(str(spoilable), training=4)
+    repair(str(spoilable), open_dataset(str(spoilable)).recipe, list(find_faults(str(spoilable))))
     assert tree_hash(spoilable) == tree_hash(other)
 
 

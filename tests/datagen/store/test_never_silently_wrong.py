@@ -273,7 +273,7 @@ def test_a_worker_with_other_assets_writes_nothing(spoilable: Path, monkeypatch:
     shard = shards_of(tiny_dataset())[0]
     (spoilable / shard.path).unlink()
     monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "OTHER"),))
-    with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg OTHER"):
+    with pytest.raises(DatasetError, match="was made from procedural leg 2, but here is procedural leg OTHER"):
         ensure_shards(str(spoilable), tiny_dataset(), [(shard, None)])
     assert not (spoilable / shard.path).exists()
 

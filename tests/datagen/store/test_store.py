@@ -60,19 +60,19 @@ def test_zarr_alone_reads_every_array(dataset: str) -> None:
     assert np.array_equal(group["topology/0/faces"][...], opened.faces(0))
     assert np.array_equal(group["pose/parameters"][...], opened.rotations())
     assert group["grid/topology"][...].tolist() == [0] * 5 and group["topology/vertex_count"][...].tolist() == [32]
-    rows = group["manifest/rows"][...], group["manifest/bytes"][...], group["manifest/sha256"][...]
-    assert [(row.rows, row.bytes, bytes.fromhex(row.sha256)) for row in opened.manifest] == [
+    rows = group["manifest/rows"][...], group["manifest/bytes"][...], group["manifest/blake3"][...]
+    assert [(row.rows, row.bytes, bytes.fromhex(row.blake3)) for row in opened.manifest] == [
         (*sizes, digest.tobytes()) for *sizes, digest in zip(*rows, strict=True)
     ]
 
 
-def test_meshes_are_to_the_byte_those_of_format_2(dataset: str) -> None:
-    """Shards of one identity are the very files; as that format's last version wrote them."""
-    digests = sorted(row.sha256 for row in open_dataset(dataset).manifest)
+def test_meshes_are_to_the_byte_those_of_every_version(dataset: str) -> None:
+    """A change of these bytes is a change of what recipes mean: raise the version of the body's asset with it."""
+    digests = sorted(row.blake3 for row in open_dataset(dataset).manifest)
     assert hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest() == (
-        "cbb122cdb24ff65fd84de5d2d2c7c0bf4e4ece97566fa510510e40bf239719f6"
+        "924152349283489600ca8097b97a7dd76931adf0eb01e4a570fe2b23dda57be1"
     )
-    assert open_dataset(dataset).uuid == "bf0fc157-3e2c-5ee0-af80-49d2e230f96c"
+    assert open_dataset(dataset).uuid == "7c026b12-065c-53ce-9a58-62a1fddbcbac"
 
 
 def test_several_identities_of_few_poses_share_a_shard(tmp_path: Path, dataset: str) -> None:
@@ -242,7 +242,7 @@ def test_metadata_that_is_not_json(spoilable: Path) -> None:
 
 def test_format_version_from_the_future(spoilable: Path) -> None:
     open_group(str(spoilable), mode="r+").attrs["format_version"] = 99
-    with pytest.raises(DatasetError, match="format version 99, this program reads 3; update"):
+    with pytest.raises(DatasetError, match="format version 99, this program reads 4; update"):
         open_dataset(str(spoilable))
 
 
@@ -262,7 +262,7 @@ def test_format_2_is_refused_with_the_command_that_makes_it_anew(
         with pytest.raises(SystemExit):
             main(command.format(spoilable).split())
         (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-        assert f"{spoilable} has format version 2, this program reads 3; make it anew: {advice}" in line
+        assert f"{spoilable} has format version 2, this program reads 4; make it anew: {advice}" in line
     assert tree_hash(spoilable) == kept
     main(advice.replace("NEW.zarr", f"{tmp_path}/new.zarr --local").split()[1:])
     assert open_dataset(str(tmp_path / "new.zarr")).uuid == before
@@ -362,6 +362,6 @@ def test_other_assets_are_refused_when_going_on(spoilable: Path, monkeypatch: py
     from datagen.common.assets import Asset
 
     open_group(str(spoilable), mode="r+").attrs["status"] = "building"
-    monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "2"),))
-    with pytest.raises(DatasetError, match="was made from procedural leg 1, but here is procedural leg 2"):
+    monkeypatch.setattr(LegModel, "assets", (Asset("procedural leg", "Apache-2.0", "3"),))
+    with pytest.raises(DatasetError, match="was made from procedural leg 2, but here is procedural leg 3"):
         generate(tiny_dataset(), str(spoilable))

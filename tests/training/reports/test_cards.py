@@ -55,7 +55,7 @@ def test_a_dataset_card_says_what_the_dataset_says(dataset: str) -> None:
     assert facts["meshes"] == str(3 * 6 + 2 * 10)
     assert facts["sha256 of the manifest"] == opened.attributes["manifest_sha256"]
     (assets,) = all_of(dataset_card(opened), Table)
-    assert list(assets.lines[1]) == ["procedural leg", "Apache-2.0", "1"]
+    assert list(assets.lines[1]) == ["procedural leg", "Apache-2.0", "2"]
 
 
 def test_the_recipe_on_a_dataset_card_makes_the_same_dataset(dataset: str, tmp_path: Path) -> None:

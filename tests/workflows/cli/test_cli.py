@@ -102,7 +102,7 @@ def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
     assert command("verify", data).stdout.endswith("is whole\n")
     flip_bit(data / "grid/training/0/vertices/c/2/1/0/0")
     fails(command("verify", data), 1, "has 1 faults", f"dsffnet verify {data} --repair")
-    assert "grid/training/0/vertices/c/2/1/0/0: its sha256" in command("verify", data).stdout
+    assert "grid/training/0/vertices/c/2/1/0/0: its hash" in command("verify", data).stdout
     assert "is whole again" in command("verify", data, "--repair").stdout
     assert command("verify", data).returncode == 0
 
