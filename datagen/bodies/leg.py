@@ -4,6 +4,9 @@ It needs no assets and loads at once: for tests, for trying the pipeline out, an
 family is added. Identity: length, thigh and ankle radius, knee height. It obeys ``left_hip`` and ``left_knee``.
 """
 
+from dataclasses import replace
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,7 @@ from datagen.poses import JOINTS, Poses
 from datagen.recipe import LegBody
 
 _RANGES = {"length": (0.7, 1.1), "thigh_radius": (0.06, 0.14), "ankle_radius": (0.03, 0.06), "knee": (0.45, 0.6)}
-_BONES = ("left_hip", "left_knee")
+_BONES, _PARENTS = ("left_hip", "left_knee"), (-1, 0)
 
 
 class LegModel:
@@ -31,6 +34,7 @@ class LegModel:
         shin = np.repeat(1 / (1 + np.exp((0.5 - self._along) * 40)), self._segments)
         self._weights = np.stack([1 - shin, shin], axis=1)
         self.rest = remembering(self._rest)
+        self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
@@ -60,8 +64,11 @@ class LegModel:
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """Thigh and shin; half of the rings are above the knee, so that all legs share their weights."""
-        rest = self.rest(parameters)
-        return rig_of(rest, _BONES, drivers_of(_BONES, rest.parents, joints))
+        return replace(self._shared_rig(joints), joints=_heads(parameters).astype(np.float32))
+
+    def _rig_but_joints(self, joints: tuple[str, ...]) -> Rig:
+        rest = Rest(np.empty((0, 3)), np.zeros((2, 3)), self._weights, _PARENTS)
+        return rig_of(rest, _BONES, drivers_of(_BONES, _PARENTS, joints))
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters
@@ -72,7 +79,13 @@ class LegModel:
         y = np.broadcast_to(-length * along[:, None], x.shape)
         return Rest(
             vertices=np.stack([x, y, z], axis=-1).reshape(-1, 3),
-            joints=np.array([[0.0, 0.0, 0.0], [0.0, -length * knee, 0.0]]),
+            joints=_heads(parameters),
             weights=self._weights,
-            parents=(-1, 0),
+            parents=_PARENTS,
         )
+
+
+def _heads(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Hip and knee at rest [2, 3]."""
+    length, _, _, knee = parameters
+    return np.array([[0.0, 0.0, 0.0], [0.0, -length * knee, 0.0]])
