@@ -17,6 +17,7 @@ from datagen.poses import JOINTS, Poses
 from datagen.recipe import LegBody
 
 _RANGES = {"length": (0.7, 1.1), "thigh_radius": (0.06, 0.14), "ankle_radius": (0.03, 0.06), "knee": (0.45, 0.6)}
+_LOWEST, _HIGHEST = np.transpose(list(_RANGES.values()))
 _BONES, _PARENTS = ("left_hip", "left_knee"), (-1, 0)
 
 
@@ -31,6 +32,8 @@ class LegModel:
         self._rings, self._segments = recipe.rings, recipe.segments
         self._faces = self._tube()
         self._along = np.linspace(0.0, 1.0, self._rings)
+        angle = np.linspace(0.0, 2 * np.pi, self._segments, endpoint=False)
+        self._around = np.cos(angle), np.sin(angle)
         shin = np.repeat(1 / (1 + np.exp((0.5 - self._along) * 40)), self._segments)
         self._weights = np.stack([1 - shin, shin], axis=1)
         self.rest = remembering(self._rest)
@@ -38,7 +41,7 @@ class LegModel:
 
     def draw_identity(self, random: np.random.Generator, identity: int) -> NDArray[np.float64]:
         """Parameters [4]: length, thigh radius, ankle radius (metres), knee height (fraction of length)."""
-        return np.array([random.uniform(low, high) for low, high in _RANGES.values()])
+        return random.uniform(_LOWEST, _HIGHEST)
 
     def faces(self, parameters: NDArray[np.float64]) -> NDArray[np.int32]:
         """Triangles [face, 3] of the tube and its two caps; the same for all identities."""
@@ -72,17 +75,14 @@ class LegModel:
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters
-        along = np.interp(self._along, [0.0, 0.5, 1.0], [0.0, knee, 1.0])
-        angle = np.linspace(0.0, 2 * np.pi, self._segments, endpoint=False)
-        radius = (thigh + (ankle - thigh) * along) * (1 + 0.15 * np.sin(np.pi * along) ** 2)
-        x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle) + 0.02 * np.sin(np.pi * along)[:, None]
-        y = np.broadcast_to(-length * along[:, None], x.shape)
-        return Rest(
-            vertices=np.stack([x, y, z], axis=-1).reshape(-1, 3),
-            joints=_heads(parameters),
-            weights=self._weights,
-            parents=_PARENTS,
-        )
+        along = np.interp(self._along, [0.0, 0.5, 1.0], [0.0, knee, 1.0])[:, None]
+        bulge = np.sin(np.pi * along)
+        radius = (thigh + (ankle - thigh) * along) * (1 + 0.15 * bulge**2)
+        vertices = np.empty((self._rings, self._segments, 3))
+        vertices[..., 0] = radius * self._around[0]
+        vertices[..., 1] = -length * along
+        vertices[..., 2] = radius * self._around[1] + 0.02 * bulge
+        return Rest(vertices.reshape(-1, 3), _heads(parameters), self._weights, _PARENTS)
 
 
 def _heads(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
