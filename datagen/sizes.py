@@ -23,8 +23,8 @@ _LOOKED_AT = 24
 _DISK_SHARE, _DISK_MESH, _DISK_IDENTITY, _DISK_POSE = 0.85, 120, 100, 600
 """After compression; and bytes beside the vertices. Anny's bodies compress to 0.80, legs to 0.76."""
 _SECONDS_MESH, _SECONDS_VERTEX, SECONDS_IDENTITY, SECONDS_POSE = 110e-6, 33e-9, 1e-3, 0.4e-3
-_MEMORY_IDENTITY, _MEMORY_POSE, _MEMORY_SHARD, _MEMORY_TRIPLE = 3_000, 2_000, 1_000, 120
-"""What the driver keeps. Of an identity mostly its own weights: a leg of 288 vertices has 2.3 kB, Anny none."""
+_MEMORY_IDENTITY, _MEMORY_POSE, _MEMORY_SHARD, _MEMORY_TRIPLE = 1_500, 2_000, 1_000, 120
+"""What the driver keeps, with room to spare: of an identity 0.3 kB (legs) to 1 kB (Anny)."""
 _MEMORY_VERTEX, _MEMORY_MESHES = 460, 3
 """Bytes of a body a vertex, and how often a task holds the vertices of its shard."""
 _PROCESSES, _OTHERS = "the number of workers", "what other programs take"

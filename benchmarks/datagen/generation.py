@@ -197,7 +197,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 measure(topology, Path(folder))
     memory(topologies[-1])
-    scaling(topologies[-1], identities=400)
+    scaling(topologies[0], identities=400)
 
 
 if __name__ == "__main__":

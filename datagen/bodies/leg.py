@@ -36,6 +36,7 @@ class LegModel:
         self._around = np.cos(angle), np.sin(angle)
         shin = np.repeat(1 / (1 + np.exp((0.5 - self._along) * 40)), self._segments)
         self._weights = np.stack([1 - shin, shin], axis=1)
+        self._weights.flags.writeable = False
         self.rest = remembering(self._rest)
         self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
 
@@ -66,8 +67,10 @@ class LegModel:
         return skin(rest, poses.on(_BONES, rest.parents))
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
-        """Thigh and shin; half of the rings are above the knee, so that all legs share their weights."""
-        return replace(self._shared_rig(joints), joints=_heads(parameters).astype(np.float32))
+        """Thigh and shin; as many rings lie above the knee as below it, so that all legs share their weights."""
+        shared = self._shared_rig(joints)
+        kept = [_BONES.index(name) for name in shared.names]  # one, where poses turn no knee
+        return replace(shared, joints=_heads(parameters)[kept].astype(np.float32))
 
     def _rig_but_joints(self, joints: tuple[str, ...]) -> Rig:
         rest = Rest(np.empty((0, 3)), np.zeros((2, 3)), self._weights, _PARENTS)

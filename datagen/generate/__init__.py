@@ -212,12 +212,12 @@ def _make_missing(
         else:
             missing.append((shard, row.blake3 if row else None))
     tasks = [(url, recipe, some) for some in batches(recipe, missing)]
-    done, settled = sum(row.rows for row in rows), len(rows) if before else 0
+    done, kept = sum(row.rows for row in rows), len(rows) if before else 0
     with closing(closable(run(ensure_shards, tasks))) as ran, _saving(url, recipe, rows, doubted) as add:
         results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
             add(made)
-    finish(url, recipe, rows, settled=settled)
+    finish(url, recipe, rows, written=rows[kept:])
 
 
 @contextmanager

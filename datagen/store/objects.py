@@ -64,12 +64,9 @@ class LocalObjects(LocalStore):
             return None
         return status.st_size if stat.S_ISREG(status.st_mode) else None
 
-    def names(self, folder: str = "") -> list[str]:
-        """Names of what lies directly in the root, or in a folder below it; none where there is no such folder."""
-        try:
-            return sorted(os.listdir(f"{self.root}/{folder}"))
-        except (FileNotFoundError, NotADirectoryError):
-            return []
+    def names(self) -> list[str]:
+        """Names of what lies directly in the folder."""
+        return sorted(os.listdir(self.root)) if self.root.is_dir() else []
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
         for path in self.paths(prefix):  # Zarr's own way takes several times as long
@@ -233,14 +230,9 @@ def list_objects(group: zarr.Group) -> list[str]:
 def list_leftovers(group: zarr.Group, shards: Iterable[str]) -> list[str]:
     """Paths of what killed writers left, beside these shards and beside all that is no shard."""
     if isinstance(store := group.store, LocalObjects):
-        beside = (f"{folder}/{name}" for folder in _folders(shards) for name in store.names(folder))
-        return [path for path in chain(store.paths(but=_SHARDS), beside) if is_leftover(path)]
+        beside = (store.paths(path.rpartition("/")[0]) for path in shards)
+        return [path for path in chain(store.paths(but=_SHARDS), chain.from_iterable(beside)) if is_leftover(path)]
     return [path for path in _paths(group) if is_leftover(path)]
-
-
-def _folders(paths: Iterable[str]) -> Iterable[str]:
-    """The folders that hold some objects, each once."""
-    return dict.fromkeys(path.rpartition("/")[0] for path in paths)
 
 
 def list_small_objects(group: zarr.Group) -> list[str]:

@@ -366,14 +366,18 @@ def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
             put_so_far(group, so_far)
 
 
-def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, settled: int = 0) -> None:
+def finish(
+    url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, written: Sequence[ManifestRow] | None = None
+) -> None:
     """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
 
     Parameters
     ----------
-    settled
-        How many of the first rows are of the complete dataset that this one grew from, which was opened, and so looked
-        at, as this began.
+    rows
+        Of all shards.
+    written
+        Of those to look at, their sizes and what lies beside them: where a complete dataset grew, the new ones, as
+        the others were looked at when it was opened. By default all.
 
     Raises
     ------
@@ -388,7 +392,7 @@ def finish(url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, sett
     }
     with _writing(url):
         group = ShardWriter(url, recipe).group
-        written = rows[settled:]
+        written = rows if written is None else written
         sizes = stored_sizes(group, [row.path for row in written])
         for row in written:
             if sizes.get(row.path) != row.bytes:

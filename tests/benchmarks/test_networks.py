@@ -24,7 +24,7 @@ sys.meta_path.insert(0, Absent())
 del sys.argv[0]
 runpy.run_module("benchmarks.networks.gpu", run_name="__main__", alter_sys=True)
 """
-ABSENT = "anny,google_crc32c,matplotlib,mlflow,numcodecs,pandas,pydantic,ray,safetensors,smplx,trimesh,yaml,zarr"
+ABSENT = "anny,blake3,google_crc32c,matplotlib,mlflow,numcodecs,pandas,pydantic,ray,safetensors,smplx,trimesh,yaml,zarr"
 TINY = ["--device", "cpu", "--vertices", "60", "--batches", "2", "--narrow"]
 
 

@@ -107,6 +107,22 @@ def test_its_rig_gives_its_vertices_without_it(family: Family, number: int, seed
     assert np.abs(skinned(rest, rig.weights, transforms) - vertices)[:, bare].max() < 1e-5, "draped cloth goes its way"
 
 
+@pytest.mark.parametrize("family", [name for name in FAMILIES if name != "imported"], indirect=True)
+def test_its_rig_has_a_part_for_each_that_some_poses_turn(family: Family) -> None:
+    """Of joints that the poses do not have, bones are folded into those that they follow."""
+    parameters, joints = family.identity(0), family.still(1).joints
+    every = family.body.rig(parameters, joints)
+    assert every is not None
+    for some in (joints[:1], joints[:2]):
+        rig = family.body.rig(parameters, some)
+        assert rig is not None and 1 <= len(rig.names) <= len(every.names)
+        assert rig.joints.shape == (len(rig.names), 3) and rig.weights.shape[1] == len(rig.names)
+        heads = dict(zip(every.names, every.joints.tolist(), strict=True))
+        assert all(
+            heads[name] == joint for name, joint in zip(rig.names, rig.joints.tolist(), strict=True) if name in heads
+        )
+
+
 def test_its_assets_say_what_it_is_made_from(family: Family) -> None:
     assert family.body.assets and all(asset.name and asset.licence and asset.version for asset in family.body.assets)
 

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from datagen.bodies import load_body
 from datagen.common.errors import DatasetError
 from datagen.generate import append, ensure_shards, generate, inline, repair
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
 from tests.support.files import tree_hash
-from tests.support.recipes import tiny_dataset
+from tests.support.recipes import mixed_dataset, tiny_dataset
 
 
 def shard_files(url: Path) -> dict[str, int]:
@@ -102,6 +103,19 @@ def test_what_a_killed_repair_left_beside_an_old_shard_goes_with_the_repair_that
     append(str(spoilable), training=4)
     repair(str(spoilable), open_dataset(str(spoilable)).recipe, list(find_faults(str(spoilable))))
     assert tree_hash(spoilable) == tree_hash(other)
+
+
+def test_identities_of_one_rig_keep_their_own_weights(tmp_path: Path) -> None:
+    """Legs of 30 vertices each, meshed in two ways: one rig with two kinds of weights, also of those appended."""
+    recipe = mixed_dataset()
+    made = append(generate(recipe, str(tmp_path / "legs.zarr")).url, training=9)
+    body, joints = load_body(recipe.body), tuple(made.attributes["joints"])
+    kinds = [len(made.rigs(number).weights) for number in range(len(made.attributes["rigs"]))]
+    assert kinds == [1, 2]
+    for identity in range(made.grid.identity_count):
+        rig, own = made.rig(identity), body.rig(made.parameters(identity), joints)
+        assert rig is not None and own is not None
+        assert np.array_equal(rig.weights, own.weights) and np.array_equal(rig.joints, own.joints)
 
 
 def test_what_killed_writers_left_goes_with_an_append_that_is_given_again(spoilable: Path, tmp_path: Path) -> None:

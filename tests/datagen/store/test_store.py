@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from blake3 import blake3
 
 from datagen.common.errors import DatasetError, StorageError
 from datagen.generate import ensure_shards, generate, repair
@@ -64,9 +65,11 @@ def test_zarr_alone_reads_every_array(dataset: str) -> None:
     assert [(row.rows, row.bytes, bytes.fromhex(row.blake3)) for row in opened.manifest] == [
         (*sizes, digest.tobytes()) for *sizes, digest in zip(*rows, strict=True)
     ]
+    for row in opened.manifest:
+        assert blake3((Path(dataset) / row.path).read_bytes()).hexdigest() == row.blake3
 
 
-def test_meshes_are_to_the_byte_those_of_every_version(dataset: str) -> None:
+def test_meshes_are_pinned_to_the_byte(dataset: str) -> None:
     """A change of these bytes is a change of what recipes mean: raise the version of the body's asset with it."""
     digests = sorted(row.blake3 for row in open_dataset(dataset).manifest)
     assert hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest() == (
@@ -190,7 +193,7 @@ def test_a_recipe_changed_by_hand_is_refused(spoilable: Path) -> None:
         open_dataset(str(spoilable))
 
 
-@pytest.mark.parametrize("name", ["rows", "bytes", "extent", "object_sha256"])
+@pytest.mark.parametrize("name", ["rows", "bytes", "extent", "blake3", "object_sha256"])
 def test_a_manifest_that_is_not_the_committed_one(spoilable: Path, name: str) -> None:
     array = zarr.open_array(spoilable / "manifest" / name)
     array[0] = array[0] + 1
@@ -246,13 +249,15 @@ def test_format_version_from_the_future(spoilable: Path) -> None:
         open_dataset(str(spoilable))
 
 
-def test_format_2_is_refused_with_the_command_that_makes_it_anew(
-    spoilable: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("version", [2, 3])
+def test_older_formats_are_refused_with_the_command_that_makes_them_anew(
+    spoilable: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], version: int
 ) -> None:
     """Every command, in one line; the one that it names makes the dataset, and with the same uuid."""
     before = open_dataset(str(spoilable)).uuid
-    open_group(str(spoilable), mode="r+").attrs["format_version"] = 2
-    shutil.move(spoilable / "grid", spoilable / "identity")
+    open_group(str(spoilable), mode="r+").attrs["format_version"] = version
+    old, new = {2: ("grid", "identity"), 3: ("manifest/blake3", "manifest/sha256")}[version]
+    shutil.move(spoilable / old, spoilable / new)
     kept = tree_hash(spoilable)
     advice = f"dsffnet generate --recipe {spoilable} --out NEW.zarr"
     for command in (
@@ -262,11 +267,11 @@ def test_format_2_is_refused_with_the_command_that_makes_it_anew(
         with pytest.raises(SystemExit):
             main(command.format(spoilable).split())
         (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-        assert f"{spoilable} has format version 2, this program reads 4; make it anew: {advice}" in line
+        assert f"{spoilable} has format version {version}, this program reads 4; make it anew: {advice}" in line
     assert tree_hash(spoilable) == kept
     main(advice.replace("NEW.zarr", f"{tmp_path}/new.zarr --local").split()[1:])
     assert open_dataset(str(tmp_path / "new.zarr")).uuid == before
-    assert generate(tiny_dataset(), str(spoilable), fresh=True).uuid == before and not (spoilable / "identity").exists()
+    assert generate(tiny_dataset(), str(spoilable), fresh=True).uuid == before and not (spoilable / new).exists()
 
 
 def test_recipe_changed_between_runs(spoilable: Path) -> None:
