@@ -48,7 +48,6 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
     transfers = {name: PoseTransfer.from_run(own_weights(its)) for name, its in _DIRECT.items()}
     for number, subject in enumerate(wardrobe.subjects):
         its = subject.unseen[:frames]
-        faces = wardrobe.templates[number].faces.numpy()
         sources = _sources(Poses(joints, parents, subject.rotations[its].astype(np.float64)))
         resting, *posed = sources
         read = Poses(*read_poses(own_weights("human"), [resting, *posed]))[1:]
@@ -62,7 +61,7 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
             for name, transfer in transfers.items():
                 output = transfer(source=posed[place], target=target, source_axes=UPRIGHT, target_axes=UPRIGHT)
                 made[name] = Mesh(output.vertices, truth.faces)
-            made[_SKINNED] = Mesh(by_read[place].skinned, faces)
+            made[_SKINNED] = wardrobe.mesh(number, by_read[place].skinned)
             made[_READ] = by_read[place].mesh
             made[_TRUE] = by_truth[place].mesh
             yield subject.name, frame, {"source": posed[place], "truth": truth} | made

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.low_pass import LowPass
 from training.avatar.maps import PositionMaps, Views
 from training.avatar.outfit import Outfit
 from training.avatar.subject import Subject
@@ -19,15 +20,26 @@ from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges
 from training.recipes.networks import AvatarRecipe
 
+_FILTERED = 4
+"""How often a posed surface is low-passed."""
+
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """An avatar in a pose: the points as a mesh with their normals [n, 3], and the stages that lead there [n, 3].
+    """An avatar in a pose: a mesh (:meth:`Wardrobe.mesh`) with normals [n, 3] at its vertices, and what it is made of.
 
-    ``transforms`` [bone, 3, 4] of the pose, from the canonical one.
+    Attributes
+    ----------
+    points, normals
+        As the network gives them [n, 3].
+    skinned, corrected
+        The stages that lead there [n, 3].
+    transforms
+        Of the pose [bone, 3, 4], from the canonical one.
     """
 
     mesh: Mesh
+    points: Floats
     normals: Floats
     skinned: Floats
     corrected: Floats
@@ -72,6 +84,18 @@ class Wardrobe:
             PositionMaps(self.views, _mesh(its), its.weights, size=self.recipe.map_size) for its in self.templates
         )
 
+    @cached_property
+    def _filters(self) -> tuple[LowPass, ...]:
+        return tuple(LowPass(its.faces.numpy(), len(its.vertices)) for its in self.templates)
+
+    def mesh(self, outfit: int, points: Floats) -> Mesh:
+        """The surface of an outfit's points [n, 3] in a pose, low-passed along the template's edges.
+
+        The loss knows points alone, which come to lie in disorder where skinning tears a template, as at hems. FITE has
+        no faces, and so nothing like it; without it hems are ragged (docs/results/avatar.md).
+        """
+        return Mesh(self._filters[outfit](points, _FILTERED), self.templates[outfit].faces.numpy())
+
     def to(self, device: torch.device) -> "Wardrobe":
         """Move what makes maps to a device, in place, and return this."""
         for maps in self._maps:
@@ -115,7 +139,6 @@ class Wardrobe:
         self, network: nn.Module, outfit: int, transforms: NDArray[np.floating], *, dtype: torch.dtype = torch.float32
     ) -> Iterator[Posed]:
         """The avatar in an outfit, for each of some transforms [frame, bone, 3, 4] of its bones."""
-        faces = self.templates[outfit].faces.numpy()
         for moved in transforms:
             maps, its = self.drawn([outfit], moved[None])
             avatar: Avatar = network(maps.to(dtype), its.to(dtype), [outfit])
@@ -123,7 +146,7 @@ class Wardrobe:
                 each.double().cpu().numpy()
                 for each in (avatar.points, avatar.normals, avatar.skinned, avatar.displacements)
             )
-            yield Posed(Mesh(points, faces), normals, skinned, points - displaced, moved)
+            yield Posed(self.mesh(outfit, points), points, normals, skinned, points - displaced, moved)
 
 
 def _mesh(template: Template) -> Mesh:

@@ -1,10 +1,10 @@
 """What networks are given of meshes: vertices in their boxes, and what is near along surfaces, where they take that.
 
 A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
-the edges (Taubin, "A signal processing approach to fair surface design", 1995), where it understands the mesh clearly
-better so, as one with noise. A transfer reads its meshes so, and what measures transfers of single meshes. Evaluations
-on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body, in which
-pose an avatar is to be, or onto which parts an output is projected.
+the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh clearly better so, as one with noise. A transfer
+reads its meshes so, and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise,
+do not; nor does what asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which
+parts an output is projected.
 """
 
 from collections.abc import Sequence
@@ -12,17 +12,17 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
+from datagen.mesh.low_pass import LowPass
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 
-_THERE, _BACK, _TIMES = 0.5, 0.53, 2
-"""Shares of the way to the neighbours' mean and away again, and how often: noise goes, limbs keep their size."""
+_FILTERED = 2
+"""How often a mesh is low-passed before it is read."""
 _CLEARLY, _LOOKED_AT = 0.85, 256
 """Of the misfit as the mesh is, and vertices by which it is told."""
 _NEIGHBOURS = 8
@@ -112,27 +112,11 @@ def _as_read(network: Parts, mesh: Mesh) -> Floats:
     vertices = np.asarray(mesh.vertices, np.float64)
     if not len(mesh.faces):
         return vertices
-    filtered = low_passed(mesh)
+    filtered = LowPass(mesh.faces, len(vertices))(vertices, _FILTERED)
     some = np.random.default_rng(0).permutation(len(vertices))[:_LOOKED_AT]
     looked_at = stacked(network, [vertices, filtered])[:, some]
     misfits = network.understood(looked_at)[0]
     return filtered if bool(misfits[1] < _CLEARLY * misfits[0]) else vertices
-
-
-def low_passed(mesh: Mesh) -> NDArray[np.float64]:
-    """Vertices [n, 3] of a mesh without what changes from each to the next; those on open borders stay."""
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    count = len(vertices)
-    ahead = csr_array((np.ones(3 * len(faces)), (faces.T.ravel(), np.roll(faces, -1, 1).T.ravel())), (count, count))
-    sides = (ahead + ahead.T).tocsr()  # how many faces each edge has
-    neighbours = np.diff(sides.indptr)
-    row = np.repeat(np.arange(count), neighbours)
-    free = ((np.bincount(row, sides.data == 1, count) == 0) & (neighbours > 0))[:, None]
-    mean = csr_array((1 / neighbours[row], sides.indices, sides.indptr), (count, count))
-    for _ in range(_TIMES):
-        for share in (_THERE, -_BACK):
-            vertices = vertices + np.where(free, share * (mean @ vertices - vertices), 0)
-    return vertices
 
 
 def _in_faces(mesh: Mesh) -> NDArray[np.bool_]:

@@ -166,7 +166,7 @@ def _draped_again(dataset: Dataset, subject: Subject, frame: int, scan: Mesh) ->
 
 def _methods(wardrobe: Wardrobe, network: nn.Module, number: int, frame: int, usual: Floats) -> dict[str, _Meshed]:
     """What each method makes of a frame: a mesh, and normals at its vertices."""
-    subject, faces = wardrobe.subjects[number], wardrobe.templates[number].faces.numpy()
+    subject = wardrobe.subjects[number]
     transforms = subject.transforms[frame].astype(np.float64)
     (posed,) = wardrobe.posed(network, [(number, frame)])
     bare = skinned(subject.body.vertices, subject.body.weights, transforms[None])[0]
@@ -175,12 +175,12 @@ def _methods(wardrobe: Wardrobe, network: nn.Module, number: int, frame: int, us
         displaced["nearest training pose"] = _canonical(wardrobe, number, near)
     meshes = {
         "minimal body": Mesh(bare, subject.body.faces),
-        _SKINNED: Mesh(posed.skinned, faces),
-        _CORRECTED: Mesh(posed.corrected, faces),
+        _SKINNED: wardrobe.mesh(number, posed.skinned),
+        _CORRECTED: wardrobe.mesh(number, posed.corrected),
     }
     turn = _blended(wardrobe, number, transforms)
     for name, by in displaced.items():
-        meshes[name] = Mesh(posed.corrected + (turn @ by[..., None])[..., 0], faces)
+        meshes[name] = wardrobe.mesh(number, posed.corrected + (turn @ by[..., None])[..., 0])
     found: dict[str, _Meshed] = {
         name: (mesh, vertex_normals(mesh.vertices, mesh.faces)) for name, mesh in meshes.items()
     }
@@ -196,7 +196,7 @@ def _usual_displacement(wardrobe: Wardrobe, network: nn.Module, number: int) -> 
 
 def _canonical(wardrobe: Wardrobe, number: int, posed: Posed) -> NDArray[np.float64]:
     """An avatar's displacements [n, 3] turned back to the canonical pose."""
-    displacements = posed.mesh.vertices - posed.corrected
+    displacements = posed.points - posed.corrected
     return np.asarray(np.linalg.solve(_blended(wardrobe, number, posed.transforms), displacements[..., None])[..., 0])
 
 
@@ -296,7 +296,7 @@ def _panels(wardrobe: Wardrobe, number: int, frame: int, posed: Posed) -> list[P
     avatar = Mesh(standing(posed.mesh.vertices), faces)
     return [
         Panel(Mesh(standing(scan.vertices), scan.faces), part_colors(subject.parts) / 255),
-        Panel(Mesh(standing(posed.skinned), faces), plain),
+        Panel(Mesh(standing(wardrobe.mesh(number, posed.skinned).vertices), faces), plain),
         Panel(avatar, plain),
         Panel(avatar, error_colors(away, _ERROR_LIMIT), f"mean {1000 * away.mean():.1f} mm"),
     ]

@@ -18,6 +18,11 @@ def sphere(*, radius: float = 0.5, subdivisions: int = 2) -> Mesh:
     return Mesh(np.asarray(its.vertices, np.float64), np.asarray(its.faces, np.int64))
 
 
+def noisy(mesh: Mesh, deviation: float) -> Mesh:
+    """A mesh whose vertices are moved by noise of a standard deviation, the same each time."""
+    return Mesh(mesh.vertices + np.random.default_rng(0).normal(0, deviation, mesh.vertices.shape), mesh.faces)
+
+
 def weights_of(mesh: Mesh) -> torch.Tensor:
     """Weights [n, 2]: the lower bone's fade upwards into the upper's."""
     upper = np.clip(mesh.vertices[:, 1] + 0.5, 0, 1)
