@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, vertex_normals
 from datagen.mesh.low_pass import LowPass
 from training.avatar.maps import PositionMaps, Views
 from training.avatar.outfit import Outfit
@@ -22,15 +22,22 @@ from training.recipes.networks import AvatarRecipe
 
 _FILTERED = 4
 """How often a posed surface is low-passed."""
+_OWN = 0.5
+"""Of a surface's own normals, beside one of those that are predicted; by seen poses (docs/results/avatar.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """An avatar in a pose: a mesh (:meth:`Wardrobe.mesh`) with normals [n, 3] at its vertices, and what it is made of.
+    """An avatar in a pose.
 
     Attributes
     ----------
-    points, normals
+    mesh
+        Its surface (:meth:`Wardrobe.mesh`).
+    normals
+        At the surface's vertices [n, 3], of length one: two parts as the network predicts them, one as the surface has
+        them. Predicted ones are rather wrong in tight clothes, the surface's rather in wide ones, and seldom both.
+    points
         As the network gives them [n, 3].
     skinned, corrected
         The stages that lead there [n, 3].
@@ -39,8 +46,8 @@ class Posed:
     """
 
     mesh: Mesh
-    points: Floats
     normals: Floats
+    points: Floats
     skinned: Floats
     corrected: Floats
     transforms: Floats
@@ -146,7 +153,10 @@ class Wardrobe:
                 each.double().cpu().numpy()
                 for each in (avatar.points, avatar.normals, avatar.skinned, avatar.displacements)
             )
-            yield Posed(self.mesh(outfit, points), points, normals, skinned, points - displaced, moved)
+            mesh = self.mesh(outfit, points)
+            both = normals + _OWN * vertex_normals(mesh.vertices, mesh.faces)
+            both /= np.linalg.norm(both, axis=1, keepdims=True).clip(1e-12)
+            yield Posed(mesh, both, points, skinned, points - displaced, moved)
 
 
 def _mesh(template: Template) -> Mesh:

@@ -15,6 +15,7 @@ def test_a_posed_surface_is_without_what_changes_from_point_to_point(tmp_path: P
     wardrobe = Wardrobe.of([drawn_outfit(tmp_path)], AvatarRecipe(name="avatar", **SIZES))
     (posed,) = wardrobe.posed(wardrobe.network(), [(0, 3)])
     assert np.array_equal(posed.mesh.vertices, wardrobe.mesh(0, posed.points).vertices)
+    assert np.allclose(np.linalg.norm(posed.normals, axis=1), 1)
     noise = np.random.default_rng(0).normal(0, 0.005, posed.points.shape)
     left = wardrobe.mesh(0, posed.points + noise).vertices - posed.mesh.vertices
     assert np.linalg.norm(left, axis=1).mean() < 0.6 * np.linalg.norm(noise, axis=1).mean()
