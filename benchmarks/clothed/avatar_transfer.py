@@ -5,6 +5,7 @@ python -m benchmarks.clothed.avatar_transfer runs/avatar [--frames 8] [--picture
 The source is a bare person of Anny in the avatar's unseen poses. The networks move a scan of the dressed person in the
 seen pose that turns joints least; the avatar is driven by the pose that the weights `human` read off the source, and by
 the true one. Outputs are moved to where they are nearest to the truth: where a body stands is not asked.
+Normals are those of the meshes; of these, an avatar's surface is smoothed where a pose tears it, other outputs are not.
 """
 
 import argparse
@@ -61,7 +62,7 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
             for name, transfer in transfers.items():
                 output = transfer(source=posed[place], target=target, source_axes=UPRIGHT, target_axes=UPRIGHT)
                 made[name] = Mesh(output.vertices, truth.faces)
-            made[_SKINNED] = wardrobe.mesh(number, by_read[place].skinned)
+            made[_SKINNED] = wardrobe.surface(number, by_read[place].skinned)
             made[_READ] = by_read[place].mesh
             made[_TRUE] = by_truth[place].mesh
             yield subject.name, frame, {"source": posed[place], "truth": truth} | made

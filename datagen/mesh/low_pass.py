@@ -7,11 +7,11 @@ from scipy.sparse import csr_array
 from datagen.common.arrays import Floats, Integers
 
 _THERE, _BACK = 0.5, 0.53
-"""Shares of the way to the neighbours' mean, and away again."""
+"""Shares of the way to the neighbours' mean, and away again, a little further: limbs keep their size."""
 
 
 class LowPass:
-    """The filter of one mesh' faces (Taubin, "A signal processing approach to fair surface design", 1995).
+    """The filter of a mesh's faces (Taubin, "A signal processing approach to fair surface design", 1995).
 
     Parameters
     ----------

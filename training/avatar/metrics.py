@@ -16,8 +16,8 @@ cosine               half the sum of the absolute values of both mean cosines   
 ===================  ===========================================================  ========
 
 The last two are those of the released code, which makes a surface of the model's points and normals before it measures;
-ours has faces, and its samples have the normals n between its vertices. Figures depend
-on the number of samples: compare those of one number only.
+ours has faces, and its samples have the normals n between its vertices. Figures depend on the number of samples:
+compare those of one number only.
 """
 
 from __future__ import annotations

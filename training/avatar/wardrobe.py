@@ -11,46 +11,50 @@ from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, vertex_normals
-from datagen.mesh.low_pass import LowPass
 from training.avatar.maps import PositionMaps, Views
 from training.avatar.outfit import Outfit
+from training.avatar.posed_surface import PosedSurface
 from training.avatar.subject import Subject
 from training.avatar.template import Template
 from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges
 from training.recipes.networks import AvatarRecipe
 
-_FILTERED = 4
-"""How often a posed surface is low-passed."""
 _OWN = 0.5
-"""Of a surface's own normals, beside one of those that are predicted; by seen poses (docs/results/avatar.md)."""
+"""Of a surface's own normals beside those that are predicted; by seen poses (docs/results/avatar.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """An avatar in a pose.
+    """An avatar in a pose, in metres.
 
     Attributes
     ----------
     mesh
-        Its surface (:meth:`Wardrobe.mesh`).
-    normals
-        At the surface's vertices [n, 3], of length one: two parts as the network predicts them, one as the surface has
-        them. Predicted ones are rather wrong in tight clothes, the surface's rather in wide ones, and seldom both.
-    points
-        As the network gives them [n, 3].
+        Its surface (:mod:`training.avatar.posed_surface`).
+    points, predicted
+        Points [n, 3] and their normals as the network gives them.
     skinned, corrected
-        The stages that lead there [n, 3].
+        The stages that lead to the points [n, 3].
     transforms
         Of the pose [bone, 3, 4], from the canonical one.
     """
 
     mesh: Mesh
-    normals: Floats
     points: Floats
+    predicted: Floats
     skinned: Floats
     corrected: Floats
     transforms: Floats
+
+    @cached_property
+    def normals(self) -> NDArray[np.float64]:
+        """At the surface's vertices [n, 3], of length one: two parts as predicted, one as the surface has them.
+
+        Either alone is further from the scan's (docs/results/avatar.md).
+        """
+        both = self.predicted + _OWN * vertex_normals(self.mesh.vertices, self.mesh.faces)
+        return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +96,12 @@ class Wardrobe:
         )
 
     @cached_property
-    def _filters(self) -> tuple[LowPass, ...]:
-        return tuple(LowPass(its.faces.numpy(), len(its.vertices)) for its in self.templates)
+    def _surfaces(self) -> tuple[PosedSurface, ...]:
+        return tuple(PosedSurface(its) for its in self.templates)
 
-    def mesh(self, outfit: int, points: Floats) -> Mesh:
-        """The surface of an outfit's points [n, 3] in a pose, low-passed along the template's edges.
-
-        The loss knows points alone, which come to lie in disorder where skinning tears a template, as at hems. FITE has
-        no faces, and so nothing like it; without it hems are ragged (docs/results/avatar.md).
-        """
-        return Mesh(self._filters[outfit](points, _FILTERED), self.templates[outfit].faces.numpy())
+    def surface(self, outfit: int, points: Floats) -> Mesh:
+        """The surface of an outfit's points [n, 3] in a pose."""
+        return self._surfaces[outfit](points)
 
     def to(self, device: torch.device) -> "Wardrobe":
         """Move what makes maps to a device, in place, and return this."""
@@ -153,10 +153,7 @@ class Wardrobe:
                 each.double().cpu().numpy()
                 for each in (avatar.points, avatar.normals, avatar.skinned, avatar.displacements)
             )
-            mesh = self.mesh(outfit, points)
-            both = normals + _OWN * vertex_normals(mesh.vertices, mesh.faces)
-            both /= np.linalg.norm(both, axis=1, keepdims=True).clip(1e-12)
-            yield Posed(mesh, both, points, skinned, points - displaced, moved)
+            yield Posed(self.surface(outfit, points), points, normals, skinned, points - displaced, moved)
 
 
 def _mesh(template: Template) -> Mesh:

@@ -175,16 +175,16 @@ def _methods(wardrobe: Wardrobe, network: nn.Module, number: int, frame: int, us
         displaced["nearest training pose"] = _canonical(wardrobe, number, near)
     meshes = {
         "minimal body": Mesh(bare, subject.body.faces),
-        _SKINNED: wardrobe.mesh(number, posed.skinned),
-        _CORRECTED: wardrobe.mesh(number, posed.corrected),
+        _SKINNED: wardrobe.surface(number, posed.skinned),
+        _CORRECTED: wardrobe.surface(number, posed.corrected),
     }
     turn = _blended(wardrobe, number, transforms)
     for name, by in displaced.items():
-        meshes[name] = wardrobe.mesh(number, posed.corrected + (turn @ by[..., None])[..., 0])
+        meshes[name] = wardrobe.surface(number, posed.corrected + (turn @ by[..., None])[..., 0])
     found: dict[str, _Meshed] = {
         name: (mesh, vertex_normals(mesh.vertices, mesh.faces)) for name, mesh in meshes.items()
     }
-    return found | {_AVATAR: (posed.mesh, np.asarray(posed.normals, np.float64))}
+    return found | {_AVATAR: (posed.mesh, posed.normals)}
 
 
 def _usual_displacement(wardrobe: Wardrobe, network: nn.Module, number: int) -> NDArray[np.float64]:
@@ -236,7 +236,8 @@ def markdown(rows: list[Measured]) -> str:
         "",
         "Means over poses. Millimetres, but normals in degrees; Chamfer and cosine as FITE's released "
         "code defines them (half sums, over the diagonal of the box). Corresponding: how far points are from the "
-        "places on the cloth that they lie on in the plainest seen pose.",
+        "places on the cloth that they lie on in the plainest seen pose. Surfaces of the template are smoothed where a "
+        "pose tears it.",
     ]
     if any(row.method == _FLOOR for row in rows):
         lines[-1] += (
@@ -296,7 +297,7 @@ def _panels(wardrobe: Wardrobe, number: int, frame: int, posed: Posed) -> list[P
     avatar = Mesh(standing(posed.mesh.vertices), faces)
     return [
         Panel(Mesh(standing(scan.vertices), scan.faces), part_colors(subject.parts) / 255),
-        Panel(Mesh(standing(wardrobe.mesh(number, posed.skinned).vertices), faces), plain),
+        Panel(Mesh(standing(wardrobe.surface(number, posed.skinned).vertices), faces), plain),
         Panel(avatar, plain),
         Panel(avatar, error_colors(away, _ERROR_LIMIT), f"mean {1000 * away.mean():.1f} mm"),
     ]

@@ -38,7 +38,7 @@ def test_a_sheet_upside_down_has_the_released_cosine_of_one_and_an_angle_of_180(
     assert (found.cosine, found.normal_angle) == (pytest.approx(1), pytest.approx(180))
 
 
-def test_the_cosine_is_of_the_normals_that_the_model_predicts() -> None:
+def test_the_cosine_is_of_the_normals_that_are_given() -> None:
     scan = sheet(0.0)
     leaning = np.tile([np.sin(np.pi / 3), np.cos(np.pi / 3), 0.0], (len(scan.vertices), 1))
     assert score(scan, leaning, scan, samples=1000).cosine == pytest.approx(0.5)

@@ -138,7 +138,7 @@ class FrameFeed:
 
 
 class AvatarValidation:
-    """``evaluation/plane_seen``, ``plane_unseen``: mm of points from the scans' planes; the latter decides."""
+    """``evaluation/plane_seen``, ``plane_unseen``: mm of surfaces from the scans' planes; the latter decides."""
 
     _FRAMES = 4
 
