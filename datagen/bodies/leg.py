@@ -36,7 +36,6 @@ class LegModel:
         self._around = np.cos(angle), np.sin(angle)
         shin = np.repeat(1 / (1 + np.exp((0.5 - self._along) * 40)), self._segments)
         self._weights = np.stack([1 - shin, shin], axis=1)
-        self._weights.flags.writeable = False
         self.rest = remembering(self._rest)
         self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
 
@@ -74,7 +73,9 @@ class LegModel:
 
     def _rig_but_joints(self, joints: tuple[str, ...]) -> Rig:
         rest = Rest(np.empty((0, 3)), np.zeros((2, 3)), self._weights, _PARENTS)
-        return rig_of(rest, _BONES, drivers_of(_BONES, _PARENTS, joints))
+        rig = rig_of(rest, _BONES, drivers_of(_BONES, _PARENTS, joints))
+        rig.weights.flags.writeable = False
+        return rig
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         length, thigh, ankle, knee = parameters

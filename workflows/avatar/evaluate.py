@@ -149,7 +149,7 @@ def _plainest(subject: Subject) -> int:
 def _footprints(
     wardrobe: Wardrobe, network: nn.Module, number: int, plainest: int, usual: Floats
 ) -> dict[str, Footprints]:
-    """Where on the cloth the points of each method lie in the plainest pose, which itself says nothing of sliding."""
+    """Where on the cloth the vertices of each method lie in the plainest pose, which itself says nothing of sliding."""
     scan = outer_scan(wardrobe.subjects[number], plainest)
     meshes = _methods(wardrobe, network, number, plainest, usual)
     return {method: Footprints.of(mesh.vertices, scan) for method, (mesh, _) in meshes.items()}
@@ -235,7 +235,7 @@ def markdown(rows: list[Measured]) -> str:
         "# What the avatar reaches",
         "",
         "Means over poses. Millimetres, but normals in degrees; Chamfer and cosine as FITE's released "
-        "code defines them (half sums, over the diagonal of the box). Corresponding: how far points are from the "
+        "code defines them (half sums, over the diagonal of the box). Corresponding: how far vertices are from the "
         "places on the cloth that they lie on in the plainest seen pose. Surfaces of the template are smoothed where a "
         "pose tears it.",
     ]

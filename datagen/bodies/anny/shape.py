@@ -82,7 +82,9 @@ def _variations() -> dict[str, int]:
 
 
 def _weights(mask: NDArray[np.bool_], shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    weights: NDArray[np.float64] = np.multiply.reduce(np.where(mask.T, shares[:, None], 1.0), axis=0)
+    weights = np.ones(len(mask))
+    for belongs, share in zip(mask.T, shares, strict=True):
+        weights[belongs] *= share
     return weights
 
 

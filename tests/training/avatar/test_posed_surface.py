@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from datagen.mesh.geometry import vertex_normals
+from datagen.mesh.low_pass import LowPass
 from tests.support.shapes.avatars import SIZES, sphere, weights_of
 from tests.support.shapes.outfits import bare_template, drawn_outfit
 from training.avatar.posed_surface import PosedSurface
@@ -26,6 +27,17 @@ def test_it_is_smooth_where_edges_come_out_long_and_else_the_points() -> None:
     assert np.array_equal(found[calm], points[calm])
     left = np.linalg.norm(found - points, axis=1)[upper].mean()
     assert left < 0.6 * np.linalg.norm(noise, axis=1)[upper].mean()
+
+
+def test_it_begins_at_edges_half_as_long_again_and_is_whole_at_one_more() -> None:
+    ball = sphere(subdivisions=3)
+    surface = PosedSurface(bare_template(ball, weights_of(ball).numpy()))
+    low_passed = LowPass(ball.faces, len(ball.vertices))
+    for size, share in ((1.49, 0.0), (2.0, 0.5), (2.6, 1.0)):
+        points = size * ball.vertices
+        wanted = points + share * (low_passed(points, 8) - points)
+        assert np.allclose(surface(points).vertices, wanted, atol=1e-6)
+    assert np.abs(low_passed(points, 8) - points).max() > 1e-3, "these would tell"
 
 
 def test_a_posed_avatar_is_the_networks_points_its_surface_and_both_normals(tmp_path: Path) -> None:
