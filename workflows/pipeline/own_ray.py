@@ -133,10 +133,15 @@ def _family() -> list[psutil.Process]:
 
 
 def _kill(processes: list[psutil.Process]) -> None:
+    """Kill those that still run, and wait for them alone: the number of one that has ended long ago may be a thread's
+    now, which Linux cannot wait for (ENOENT from 6.16 on).
+    """
+    killed = list[psutil.Process]()
     for process in processes:
         with suppress(psutil.NoSuchProcess):
             process.kill()
-    psutil.wait_procs(processes, timeout=5)
+            killed.append(process)
+    psutil.wait_procs(killed, timeout=5)
 
 
 def _is_rays(process: psutil.Process) -> bool:
