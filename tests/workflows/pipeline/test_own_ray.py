@@ -14,7 +14,7 @@ def sleeping() -> psutil.Process:
 
 
 def test_what_ended_long_ago_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its number may be a thread's by then: Linux 6.16 and later have no pidfd of that, which psutil raises as it is."""
+    """Its number may be a thread's by then, of which Linux 6.16 and later have no pidfd: psutil raises as it is."""
     ended, alive = sleeping(), sleeping()
     known = psutil.Process(ended.pid)
     ended.kill()
