@@ -72,7 +72,7 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
         upright = axes.turned(mesh.vertices)
         turn = facing(understand, upright, turn)
         drawn = sampled(network, Mesh(upright @ turn, mesh.faces))
-        reading = network.read(drawn.vertices, drawn)
+        reading = network.read(drawn)
         if not (error := float(network.rest_error(reading, drawn))) <= MISREAD:
             raise MeshError(
                 f"mesh {number} is no body whose pose these weights know (misread by {error:.0f} degrees, more than "

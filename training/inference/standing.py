@@ -163,7 +163,7 @@ def rest_error(network: Parts, mesh: Mesh) -> float:
     """Return by how many degrees a mesh that stands with Y up is misread (`Parts.rest_error`)."""
     upright = mesh.vertices @ facing(understanding_of(network), mesh.vertices, np.eye(3))
     drawn = sampled(network, Mesh(upright, mesh.faces))
-    return float(network.rest_error(network.read(drawn.vertices, drawn), drawn))
+    return float(network.rest_error(network.read(drawn), drawn))
 
 
 def sampled(network: Parts, mesh: Mesh) -> Sample:

@@ -30,7 +30,7 @@ from training.networks.layers.rigid_parts import (
     rotations_from_six,
     skinned,
 )
-from training.networks.layers.sampling import Sample, nearness, offsets, sample, taken, with_masses
+from training.networks.layers.sampling import Sample, Surroundings, others, sample, taken
 from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
@@ -179,7 +179,7 @@ class Parts(nn.Module):
         check_pair(target, read, self.lift.weight.dtype)
         with full_precision(target):
             drawn = sample(read, surface)
-            logits, _, rotations, joints = self.read(read, drawn)
+            logits, _, rotations, joints = self.read(drawn, read)
             return ReadTarget(target, read, drawn, logits.softmax(2), rotations, joints)
 
     def posed_target(self, source: Tensor, target: ReadTarget, surface: Surface | None = None) -> Tensor:
@@ -188,11 +188,15 @@ class Parts(nn.Module):
         with full_precision(source):
             return self._corrected(sample(source, surface), target)
 
-    def read(self, vertices: Tensor, drawn: Sample) -> Reading:
-        """Return what is read off vertices [b, n, 3], among which a sample was drawn, in training mode or not."""
-        features = self._features(vertices, drawn)
+    def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
+        """Return what is read off the vertices of a sample, or off all vertices [b, n, 3], in training mode or not."""
+        known = _OfSample()
+        features = self._passed(drawn.around, drawn, known)
         logits, rest = self.part(features), self.rest(features)
-        turns, joints = self._pose(vertices, drawn, features, logits, rest)
+        turns, joints = self._pose(drawn, features, logits, rest)
+        if vertices is not None:
+            features = self._of_all(vertices, drawn, features, known)
+            logits, rest = self.part(features), self.rest(features)
         return Reading(logits, rest, turns, joints)
 
     @torch.no_grad()
@@ -208,7 +212,7 @@ class Parts(nn.Module):
         """
         with full_precision(vertices):
             drawn = sample(vertices)
-            reading = self.read(drawn.vertices, drawn)
+            reading = self.read(drawn)
             moments = _moments(reading, drawn)
             fits = (reading.rotations * moments.crossed).sum((2, 3))
             fit, rest, all_of_it = (
@@ -227,13 +231,15 @@ class Parts(nn.Module):
         """
         with full_precision(drawn.vertices):
             at_rest = self.posed(drawn.vertices, reading.logits.softmax(2), reading.joints, reading.rotations.mT)
-            found = self._read_again(at_rest, drawn).rotations
+            found = self.read(drawn.moved(at_rest)).rotations
             cosine = (found.diagonal(dim1=2, dim2=3).sum(2) - 1) / 2
             return torch.rad2deg(cosine.clamp(-1, 1).acos()).square().mean(1).sqrt()
 
     def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
         """Return the weights [b, n, part] by which vertices [b, n, 3] are posed."""
-        return self.part(self._features(vertices, drawn)).softmax(2)
+        known = _OfSample()
+        features = self._passed(drawn.around, drawn, known)
+        return self.part(self._of_all(vertices, drawn, features, known)).softmax(2)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -241,9 +247,9 @@ class Parts(nn.Module):
         """Return the readings of all vertices of both [b, n, 3], together where they are equally many."""
         if source.shape != target.shape:
             of_source, of_target = surfaces or (None, None)
-            return self.read(source, sample(source, of_source)), self.read(target, sample(target, of_target))
+            return self.read(sample(source, of_source), source), self.read(sample(target, of_target), target)
         both = torch.cat([source, target])
-        halves = [each.chunk(2) for each in self.read(both, sample(both, surfaces and joined(surfaces)))]
+        halves = [each.chunk(2) for each in self.read(sample(both, surfaces and joined(surfaces)), both)]
         return Reading._make(first for first, _ in halves), Reading._make(second for _, second in halves)
 
     def posed_like(self, target: Tensor, readings: tuple[Reading, Reading]) -> Tensor:
@@ -257,13 +263,13 @@ class Parts(nn.Module):
         return boxed(skinned(vertices, weights, turns, joints, moved))
 
     def _corrected(self, source: Sample, target: ReadTarget) -> Tensor:
-        wanted = self.read(source.vertices, source).rotations
+        wanted = self.read(source).rotations
         vertices, as_read, drawn, weights, own, joints = target
         turns = wanted @ own.mT
 
         def posed(turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             output = self.posed(as_read, weights, joints, turns)
-            found = self._read_again(taken(output, drawn.rows), drawn).rotations
+            found = self.read(drawn.moved(taken(output, drawn.rows))).rotations
             return output, found, (wanted - found).square().sum((1, 2, 3))
 
         output, found, missing = posed(turns)
@@ -274,38 +280,30 @@ class Parts(nn.Module):
             return torch.where(is_better[:, None, None], better, output)
         return self.posed(vertices, weights, joints, torch.where(is_better[:, None, None, None], corrected, turns))
 
-    def _read_again(self, moved: Tensor, drawn: Sample) -> Reading:
-        """Return what is read off the sample's vertices [b, k, 3] where they came to lie."""
-        again = with_masses(drawn.rows, moved, drawn.masses > 0, drawn.surface)
-        return self.read(again.vertices, again)
+    def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> Tensor:
+        """Features [b, n, width] of all vertices, those of the sample [b, k, width] being known."""
+        rows, found = [drawn.rows], [features]
+        for some, around in others(vertices, drawn):
+            rows.append(some)
+            found.append(self._passed(around, drawn, known.again()))
+        return taken(torch.cat(found, dim=1), torch.cat(rows, dim=1).argsort(dim=1))
 
-    def _features(self, vertices: Tensor, drawn: Sample) -> Tensor:
+    def _passed(self, around: Surroundings, drawn: Sample, known: _OfSample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
-        of_sample = _OfSample()
-        features = self._passed(drawn.vertices, drawn.near, drawn, of_sample)
-        if vertices is drawn.vertices:
-            return features
-        return torch.cat(
-            [self._passed(some, near, drawn, of_sample.again()) for some, near in nearness(vertices, drawn)], dim=1
-        )
 
-    def _passed(self, vertices: Tensor, near: Tensor, drawn: Sample, of_sample: _OfSample) -> Tensor:
         def normed(outputs: Tensor, shift: Tensor | float = 0) -> Tensor:
-            mean, scale = of_sample(_statistics, outputs, drawn.masses)
+            mean, scale = known(_statistics, outputs, drawn.masses)
             return torch.relu((outputs - mean) * scale + shift)
-
-        masses = drawn.masses[..., None]
-        every = 1 / (near @ masses).clamp_min(1e-9)
 
         def mixed(features: Tensor, layer: nn.Module) -> Tensor:
             assert isinstance(layer, Around)
-            around = every * (near @ (masses * of_sample(layer.told, features)))
-            return features + layer.change(normed(layer.mixed(torch.cat([features, around], dim=2))))
+            heard = around.mean(known(layer.tells, features, drawn.masses))
+            return features + layer.change(normed(layer.mixed(torch.cat([features, heard], dim=2))))
 
         first, second = self.mix
-        features = normed(self.lift(torch.cat([vertices, offsets(vertices, near, drawn)], dim=2)))
+        features = normed(self.lift(torch.cat([around.vertices, around.offsets], dim=2)))
         features = mixed(normed(self.features(features)), self.around[0])
-        whole = of_sample(self._whole, features, drawn.masses)
+        whole = known(self._whole, features, drawn.masses)
         features = mixed(normed(first(features), whole), self.around[1])
         features = mixed(normed(second(features)), self.around[2])
         return mixed(features, self.around[3])
@@ -314,14 +312,9 @@ class Parts(nn.Module):
         whole = torch.relu(self.whole(features)).masked_fill(masses[..., None] == 0, 0).amax(dim=1)
         return self.from_whole(whole)[:, None]
 
-    def _pose(
-        self, vertices: Tensor, drawn: Sample, features: Tensor, logits: Tensor, rest: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _pose(self, drawn: Sample, features: Tensor, logits: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations [b, part, 3, 3] and joints [b, part, 3], from what the vertices of each part have in common."""
-        pooled = self.pooled(features)
-        if vertices is not drawn.vertices:
-            pooled, logits, rest = (taken(each, drawn.rows) for each in (pooled, logits, rest))
-        at, away = drawn.vertices, offsets(drawn.vertices, drawn.near, drawn)
+        pooled, at, away = self.pooled(features), drawn.vertices, drawn.around.offsets
         shares = (logits.softmax(2) * drawn.masses[..., None]).mT
         mass = shares.sum(2, keepdim=True)
         both = torch.cat([pooled, away, at, rest, _products(at, at), _products(at, rest)], dim=2)
@@ -346,6 +339,11 @@ class Around(nn.Module):
         with torch.no_grad():
             self.change.weight.zero_()
             self.change.bias.zero_()
+
+    def tells(self, features: Tensor, masses: Tensor) -> Tensor:
+        """What the sample's vertices say [b, k, c], times their masses [b, k]."""
+        told: Tensor = masses[..., None] * self.told(features)
+        return told
 
 
 class _OfSample:

@@ -1,13 +1,17 @@
 """The parts network's own parts: joints, samples and their masses, misfit; what all networks keep is in the laws."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from datagen.mesh.rig import part_transforms
+from tests.support.samples import offsets_of
 from tests.support.three_networks import lively, meshes
 from training.networks import build_network
+from training.networks.layers import sampling
 from training.networks.layers.rigid_parts import (
     ancestors,
     matrices,
@@ -16,7 +20,8 @@ from training.networks.layers.rigid_parts import (
     rotations_from_six,
     turned_about,
 )
-from training.networks.layers.sampling import Sample, nearness, offsets, sample
+from training.networks.layers.sampling import Sample, Surroundings, others, sample, taken
+from training.networks.layers.surface import Surface
 from training.networks.parts import Parts, Reading, boxed
 
 PARENTS = (-1, 0, 1, 0, 3)
@@ -72,9 +77,43 @@ def test_offsets_point_out_of_the_surface_however_dense_it_is() -> None:
     for count in (600, 20_000):
         vertices = sphere(count, upper=0.8)
         drawn = sample(vertices)
-        found = torch.cat([offsets(some, near, drawn) for some, near in nearness(vertices, drawn)], dim=1)
-        outward = torch.nn.functional.cosine_similarity(found, vertices, dim=2)
+        outward = torch.nn.functional.cosine_similarity(offsets_of(vertices, drawn), vertices, dim=2)
         assert outward.mean() > (0.8 if count == 600 else 0.95)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("told", [False, True])
+def test_vertices_beyond_the_sample_hear_what_they_would_of_all_of_it(
+    monkeypatch: pytest.MonkeyPatch, told: bool
+) -> None:
+    network = lively("parts").double()
+    assert isinstance(network, Parts)
+    vertices = 2.3 * torch.cat([sphere(3000, upper=0.8), sphere(3000, upper=0.3, seed=1)]).double()
+    surface = Surface(torch.zeros(2, 3000, dtype=torch.long), torch.ones(2, 1, 1, dtype=torch.bool)) if told else None
+    drawn = sample(vertices, surface)
+    found = network.read(drawn, vertices)
+    assert all(around.near.shape[2] < 1000 for _, around in others(vertices, drawn)), "some of it is out of reach"
+    monkeypatch.setattr(sampling, "_REACH", 9.0)
+    assert all(around.near.shape[2] == 1024 for _, around in others(vertices, drawn))
+    for one, other in zip(found, network.read(drawn, vertices), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
+    inside = taken(found.logits, drawn.rows)
+    torch.testing.assert_close(inside, network.read(drawn).logits, rtol=0, atol=1e-9)
+
+
+def test_a_mesh_that_is_its_own_sample_is_passed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, vertices, passed = lively("parts"), meshes(1024, seed=3), []
+    assert isinstance(network, Parts)
+    once = network._passed
+
+    def counted(around: Surroundings, *rest: Any) -> torch.Tensor:
+        passed.append(around.vertices.shape[1])
+        return once(around, *rest)
+
+    monkeypatch.setattr(network, "_passed", counted)
+    drawn = sample(vertices)
+    assert torch.equal(taken(network.read(drawn, vertices).rest, drawn.rows), network.read(drawn).rest)
+    assert passed == [1024, 1024]
 
 
 def test_parts_that_are_not_turned_leave_the_mesh_in_its_box() -> None:
@@ -128,9 +167,9 @@ class Turning(Parts):
 
     degrees = 0.0
 
-    def read(self, vertices: torch.Tensor, drawn: Sample) -> Reading:
+    def read(self, drawn: Sample, vertices: torch.Tensor | None = None) -> Reading:
         turn = torch.from_numpy(Rotation.from_euler("y", self.degrees, degrees=True).as_matrix()).float()
-        found = super().read(vertices, drawn)
+        found = super().read(drawn, vertices)
         return found._replace(rotations=turn.expand_as(found.rotations))
 
 
@@ -138,7 +177,7 @@ class Turning(Parts):
 def test_rest_error_is_what_is_read_of_a_mesh_at_rest(degrees: float) -> None:
     network = Turning(joints={"pelvis": None, "head": "pelvis"}, width=8, token_width=8, blocks=1).eval()
     drawn = sample(meshes(60, seed=4))
-    reading = network.read(drawn.vertices, drawn)
+    reading = network.read(drawn)
     network.degrees = degrees
     torch.testing.assert_close(network.rest_error(reading, drawn), torch.full((2,), degrees), atol=0.05, rtol=0)
 
@@ -148,8 +187,8 @@ def test_rest_error_does_not_depend_on_how_the_mesh_is_turned_where_the_reading_
     network, vertices = lively("parts").eval(), meshes(60, seed=4)
     assert isinstance(network, Parts)
     drawn = sample(vertices)
-    reading = network.read(drawn.vertices, drawn)
+    reading = network.read(drawn)
     turn = torch.from_numpy(Rotation.from_euler("y", 90, degrees=True).as_matrix()).float()
     along = reading._replace(rotations=turn @ reading.rotations, joints=reading.joints @ turn.mT)
-    lying = drawn._replace(vertices=drawn.vertices @ turn.mT)
+    lying = drawn.moved(drawn.vertices @ turn.mT)
     torch.testing.assert_close(network.rest_error(along, lying), network.rest_error(reading, drawn), atol=0.1, rtol=0)

@@ -25,11 +25,44 @@ than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 _MOST = 1024
-_MOST_AT_ONCE = 1024
+_AT_ONCE = 512
+"""Vertices that are not of the sample and lie in one region or in regions beside each other."""
+_REGION = 0.25
 _RADIUS = 0.1
 """Of the Gaussian that counts neighbours: about that of an arm."""
+_REACH = 5 * _RADIUS
+"""Further off the Gaussian is below 4e-6, and not worked out."""
 _NODES = 12
 """Of the grid on which all vertices are counted, in half the longest edge of a mesh' box."""
+
+
+class Surroundings(NamedTuple):
+    """What of a sample lies around some vertices of the same meshes.
+
+    Attributes
+    ----------
+    vertices
+        [b, m, 3].
+    near
+        Gaussian [b, m, c] of their distances from those of the sample; next to nothing where they merely touch.
+    columns
+        The numbers of those in the sample [b, c]; None: all of it.
+    every
+        One over the mass that is near each [b, m, 1].
+    offsets
+        How far [b, m, 3] they lie from the middle of what is near, in units of the Gaussian. It points out of the
+        surface, the further the more that is curved: a normal that needs no faces.
+    """
+
+    vertices: Tensor
+    near: Tensor
+    columns: Tensor | None
+    every: Tensor
+    offsets: Tensor
+
+    def mean(self, weighted: Tensor) -> Tensor:
+        """Return the mean [b, m, c] of what is near, of the sample's values times its masses [b, k, c]."""
+        return self.every * (self.near @ _among(weighted, self.columns))
 
 
 class Sample(NamedTuple):
@@ -39,21 +72,30 @@ class Sample(NamedTuple):
     ----------
     rows
         Their numbers [b, k].
-    vertices
-        [b, k, 3].
     masses
         [b, k], about the surface's area around each; they sum to one. Zero: of no account.
-    near
-        Gaussian [b, k, k] of their distances from each other; next to nothing between those that merely touch.
+    around
+        The vertices [b, k, 3] themselves, and what lies around them.
     surface
         Of the meshes, for all their vertices; None: what touches is near.
+    apart
+        `Surface.apart` of the sample.
     """
 
     rows: Tensor
-    vertices: Tensor
     masses: Tensor
-    near: Tensor
+    around: Surroundings
     surface: Surface | None
+    apart: Tensor | None
+
+    @property
+    def vertices(self) -> Tensor:
+        """[b, k, 3]."""
+        return self.around.vertices
+
+    def moved(self, vertices: Tensor) -> Sample:
+        """Return it where its vertices came to lie [b, k, 3]."""
+        return _with_masses(self.rows, vertices, self.masses > 0, self.surface, self.apart)
 
 
 def masses_by(norm_weights: str, vertices: Tensor) -> Tensor | None:
@@ -89,15 +131,17 @@ def vertex_masses(vertices: Tensor) -> Tensor:
 
 def sample(vertices: Tensor, surface: Surface | None = None) -> Sample:
     """Return 1,024 vertices [b, k, 3] of meshes [b, n, 3] or fewer, whatever the vertices' order (but for ties)."""
-    index, chosen = _thinned(vertices.detach(), surface)
-    drawn = with_masses(index, taken(vertices, index), chosen, surface)
+    rows, chosen = _thinned(vertices.detach(), surface)
+    apart = None if surface is None else surface.apart(rows)
+    drawn = _with_masses(rows, taken(vertices, rows), chosen, surface, apart)
     broken = vertices.detach().sum((1, 2), keepdim=True) * 0  # not a number where one is, in the sample or not
     return drawn._replace(masses=drawn.masses + broken[..., 0])
 
 
 def taken(vertices: Tensor, index: Tensor) -> Tensor:
     """Return the rows [b, k, c] of [b, n, c] by number [b, k]."""
-    return vertices.gather(1, index[..., None].expand(-1, -1, vertices.shape[2]))
+    first = torch.arange(len(index), device=index.device)[:, None] * vertices.shape[1]
+    return vertices.flatten(0, 1).index_select(0, (index + first).flatten()).view(*index.shape, -1)
 
 
 @torch.no_grad()
@@ -126,34 +170,54 @@ def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]
     return order.gather(1, kept.indices), kept.values > -9
 
 
-def with_masses(index: Tensor, vertices: Tensor, chosen: Tensor, surface: Surface | None) -> Sample:
+def _with_masses(
+    rows: Tensor, vertices: Tensor, chosen: Tensor, surface: Surface | None, apart: Tensor | None
+) -> Sample:
     """Return the sample of vertices [b, k, 3], each of a mass by how few of the chosen ones [b, k] are near it."""
-    apart = None if surface is None else of_cells(surface.apart(index), surface.at(index).cells)
-    near = _near(vertices, vertices, apart)
+    told = None if surface is None or apart is None else of_cells(apart, surface.cells.gather(1, rows))
+    near = _near(vertices, vertices, told)
     masses = chosen / (near @ chosen.to(near.dtype)[..., None])[..., 0].clamp_min(1e-6)
-    return Sample(index, vertices, masses / masses.sum(dim=1, keepdim=True), near, surface)
+    masses = masses / masses.sum(dim=1, keepdim=True)
+    return Sample(rows, masses, _surroundings(vertices, near, vertices, masses), surface, apart)
 
 
-def nearness(vertices: Tensor, drawn: Sample) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield all vertices [b, n, 3] of the meshes, some [b, m, 3] at a time, each with its Gaussian [b, m, k]."""
-    surface, start = drawn.surface, 0
-    apart = None if surface is None else surface.apart(drawn.rows)
-    for some in vertices.split(_MOST_AT_ONCE, dim=1):  # type: ignore[no-untyped-call]
-        told = None
-        if surface is not None and apart is not None:
-            told = of_cells(apart, surface.cells[:, start : start + some.shape[1]])
-        start += some.shape[1]
-        yield some, _near(some, drawn.vertices, told)
+def others(vertices: Tensor, drawn: Sample) -> Iterator[tuple[Tensor, Surroundings]]:
+    """Yield the vertices of meshes [b, n, 3] that are not in the sample, some at a time, with their numbers [b, m]."""
+    count = vertices.shape[1] - drawn.rows.shape[1]
+    if not count:
+        return
+    x, y, z = (vertices.detach().nan_to_num().clamp(-_BEYOND, _BEYOND) / _REGION).floor().long().unbind(2)
+    region = ((y * 64 + x) * 64 + z).scatter(1, drawn.rows, 1 << 20)
+    for rows in region.argsort(dim=1, stable=True)[:, :count].split(_AT_ONCE, dim=1):  # type: ignore[no-untyped-call]
+        some = taken(vertices, rows)
+        columns, told = _within_reach(some, drawn.vertices), None
+        if drawn.surface is not None and drawn.apart is not None:
+            apart = drawn.apart.gather(2, columns[:, None].expand(-1, drawn.apart.shape[1], -1))
+            told = of_cells(apart, drawn.surface.cells.gather(1, rows))
+        near = _near(some, taken(drawn.vertices, columns), told)
+        yield rows, _surroundings(some, near, drawn.vertices, drawn.masses, columns)
 
 
-def offsets(vertices: Tensor, near: Tensor, drawn: Sample) -> Tensor:
-    """Return how far [b, n, 3] vertices lie from the middle of the sample near them, in units of the Gaussian.
+@torch.no_grad()
+def _within_reach(vertices: Tensor, others: Tensor) -> Tensor:
+    """The numbers [b, c] of at least those others [b, k, 3] that may be near one of the vertices [b, n, 3]."""
+    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
+    away = ((low - others).clamp_min(0) + (others - high).clamp_min(0)).square().sum(dim=2)
+    count = int((away < _REACH**2).sum(dim=1).amax())
+    return away.topk(max(count, 1), dim=1, largest=False).indices
 
-    It points out of the surface, the further the more that is curved: a normal that needs no faces.
-    """
-    weighted = drawn.masses[..., None] * torch.cat([drawn.vertices, torch.ones_like(drawn.vertices[..., :1])], dim=2)
-    sums = near @ weighted
-    return (vertices - sums[..., :3] / sums[..., 3:].clamp_min(1e-12)) * (2 / _RADIUS)
+
+def _surroundings(
+    vertices: Tensor, near: Tensor, others: Tensor, masses: Tensor, columns: Tensor | None = None
+) -> Surroundings:
+    weighted = masses[..., None] * torch.cat([others, torch.ones_like(others[..., :1])], dim=2)
+    sums = near @ _among(weighted, columns)
+    every = 1 / sums[..., 3:].clamp_min(1e-12)
+    return Surroundings(vertices, near, columns, every, (vertices - every * sums[..., :3]) * (2 / _RADIUS))
+
+
+def _among(values: Tensor, columns: Tensor | None) -> Tensor:
+    return values if columns is None else taken(values, columns)
 
 
 def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:

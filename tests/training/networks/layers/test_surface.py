@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from datagen.mesh.geometry import Mesh, edges_of
+from tests.support.samples import offsets_of
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
-from training.networks.layers.sampling import nearness, offsets, sample
+from training.networks.layers.sampling import sample
 from training.networks.layers.surface import joined, of_cells, surface_of
 from training.networks.parts import Parts
 
@@ -90,7 +91,7 @@ def test_layers_that_touch_all_over_hear_of_themselves(steps: int) -> None:
     drawn = sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
     kept = drawn.vertices[0][drawn.masses[0] > 0]
     assert abs(float((kept[:, 1] > 0.01).float().mean()) - 0.5) < 0.1
-    assert torch.cat([offsets(some, each, drawn) for some, each in nearness(vertices, drawn)], 1).abs().max() < 2.5
+    assert offsets_of(vertices, drawn).abs().max() < 2.5
 
 
 def test_offsets_of_one_finger_are_not_the_others() -> None:
@@ -98,10 +99,7 @@ def test_offsets_of_one_finger_are_not_the_others() -> None:
     vertices = torch.from_numpy(mesh.vertices).float()[None]
     upper = torch.arange(len(mesh.vertices)) >= len(mesh.vertices) // 2
     told = surface_of(mesh.vertices, edges_of(mesh.faces))
-    aside = [
-        torch.cat([offsets(some, each, drawn) for some, each in nearness(vertices, drawn)], 1)[0, :, 1]
-        for drawn in (sample(vertices), sample(vertices, told))
-    ]
+    aside = [offsets_of(vertices, drawn)[0, :, 1] for drawn in (sample(vertices), sample(vertices, told))]
     far = vertices[0, :, 0] < 0.4
     assert (aside[0][far & upper].mean() - aside[0][far & ~upper].mean()).abs() > 0.1  # away from each other
     assert (aside[1][far & upper].mean() - aside[1][far & ~upper].mean()).abs() < 0.02  # as if it were alone
