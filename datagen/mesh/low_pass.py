@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from datagen.common.arrays import Floats, Integers
+from datagen.mesh.geometry import Mesh, edges_of
 
 _THERE, _BACK = 0.5, 0.53
 """Shares of the way to the neighbours' mean, and away again, a little further: limbs keep their size."""
@@ -37,3 +38,33 @@ class LowPass:
             for share in (_THERE, -_BACK):
                 found = found + np.where(self._free, share * (self._mean @ found - found), 0)
         return found
+
+
+class LowPassWhereTorn:
+    """The same where vertices come to lie further from their neighbours than at rest; the others stay exactly.
+
+    Parameters
+    ----------
+    rest
+        Whose faces and edges' lengths are taken.
+    torn
+        How many times as long as at rest the edges at a vertex are together where it begins to be filtered. At one more
+        it is filtered wholly.
+    """
+
+    def __init__(self, rest: Mesh, *, torn: float) -> None:
+        self._edges, self._torn = edges_of(rest.faces), torn
+        self._lengths = self._lengths_at(rest.vertices)
+        self._low_passed = LowPass(rest.faces, len(rest.vertices))
+
+    def __call__(self, vertices: Floats, times: int) -> NDArray[np.float64]:
+        """Return vertices [n, 3] filtered so many times where they are torn."""
+        longer = self._lengths_at(vertices) / self._lengths.clip(1e-9)
+        share = np.clip(longer - self._torn, 0, 1)[:, None]
+        filtered = vertices + share * (self._low_passed(vertices, times) - vertices)
+        return np.where(share > 0, filtered, vertices)
+
+    def _lengths_at(self, vertices: Floats) -> NDArray[np.float64]:
+        """The sum of the lengths of the edges at each vertex [n]."""
+        lengths = np.linalg.norm(vertices[self._edges[:, 0]] - vertices[self._edges[:, 1]], axis=1)
+        return np.asarray(np.bincount(self._edges.T.ravel(), np.tile(lengths, 2), len(vertices)), np.float64)

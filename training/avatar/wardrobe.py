@@ -11,17 +11,19 @@ from torch import Tensor, nn
 
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, vertex_normals
+from datagen.mesh.low_pass import LowPassWhereTorn
 from training.avatar.maps import PositionMaps, Views
 from training.avatar.outfit import Outfit
-from training.avatar.posed_surface import PosedSurface
 from training.avatar.subject import Subject
 from training.avatar.template import Template
 from training.networks.avatar import Avatar, CanonicalPoints, PointAvatar
 from training.objectives.point_losses import Edges
 from training.recipes.networks import AvatarRecipe
 
+_TORN, _TIMES = 1.5, 8
+"""From where on, and how often, surfaces are low-passed; by seen poses (docs/results/avatar.md)."""
 _OWN = 0.5
-"""Of a surface's own normals beside those that are predicted; by seen poses (docs/results/avatar.md)."""
+"""Of a surface's own normals beside those that are predicted; by seen poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class Posed:
     Attributes
     ----------
     mesh
-        Its surface (:mod:`training.avatar.posed_surface`).
+        Its surface (:meth:`Wardrobe.surface`).
     points, predicted
         Points [n, 3] and their normals as the network gives them.
     skinned, corrected
@@ -51,7 +53,8 @@ class Posed:
     def normals(self) -> NDArray[np.float64]:
         """At the surface's vertices [n, 3], of length one: two parts as predicted, one as the surface has them.
 
-        Either alone is further from the scan's (docs/results/avatar.md).
+        For loose clothes either alone is further from the scan's; for tight ones its own alone are nearer
+        (docs/results/avatar.md).
         """
         both = self.predicted + _OWN * vertex_normals(self.mesh.vertices, self.mesh.faces)
         return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True), np.float64)
@@ -96,12 +99,18 @@ class Wardrobe:
         )
 
     @cached_property
-    def _surfaces(self) -> tuple[PosedSurface, ...]:
-        return tuple(PosedSurface(its) for its in self.templates)
+    def _smoothed(self) -> tuple[LowPassWhereTorn, ...]:
+        return tuple(LowPassWhereTorn(_mesh(its), torn=_TORN) for its in self.templates)
 
     def surface(self, outfit: int, points: Floats) -> Mesh:
-        """The surface of an outfit's points [n, 3] in a pose."""
-        return self._surfaces[outfit](points)
+        """The surface of an outfit's points [n, 3] in a pose: smooth where they have come to lie in disorder.
+
+        The points of a template that a pose tears, as at the hem of a skirt, jump to either side of the tear. There the
+        surface is low-passed; elsewhere it is the points', as on most of the skin (not on fingers and feet that lie in
+        disorder themselves). FITE's points have no faces: its released code makes a surface of them by Poisson's
+        equation before it measures.
+        """
+        return Mesh(self._smoothed[outfit](points, _TIMES), self.templates[outfit].faces.numpy())
 
     def to(self, device: torch.device) -> "Wardrobe":
         """Move what makes maps to a device, in place, and return this."""

@@ -1,9 +1,9 @@
-"""The low-pass filter along the edges of a mesh."""
+"""The low-pass filter along the edges of a mesh, everywhere or where it is torn."""
 
 import numpy as np
 
 from datagen.mesh.geometry import Mesh
-from datagen.mesh.low_pass import LowPass
+from datagen.mesh.low_pass import LowPass, LowPassWhereTorn
 from tests.support.shapes.avatars import noisy, sphere
 
 NO_FACES = np.zeros((0, 3), np.int64)
@@ -40,3 +40,28 @@ def test_the_order_of_vertices_and_faces_does_not_matter() -> None:
     order = random.permutation(len(ball.vertices))
     renamed = Mesh(ball.vertices[order], random.permutation(np.argsort(order)[ball.faces][:, [1, 2, 0]]))
     np.testing.assert_allclose(filtered(renamed), filtered(ball)[order], atol=1e-12)
+
+
+def test_where_edges_come_out_long_it_is_filtered_and_else_exactly_as_it_is() -> None:
+    """The upper half of a ball is torn apart by noise that is longer than its edges; the lower one moves as one."""
+    ball = sphere(subdivisions=3)
+    where_torn = LowPassWhereTorn(ball, torn=1.5)
+    upper = ball.vertices[:, 1] > 0.1
+    points = ball.vertices + np.array([0.3, 0, 0])
+    assert np.array_equal(where_torn(points, 8), points), "nothing is longer than it was"
+    noise = np.random.default_rng(0).normal(0, 0.15, points.shape) * upper[:, None]
+    found = where_torn(points + noise, 8)
+    calm = ball.vertices[:, 1] < -0.1
+    assert np.array_equal(found[calm], points[calm])
+    left = np.linalg.norm(found - points, axis=1)[upper].mean()
+    assert left < 0.6 * np.linalg.norm(noise, axis=1)[upper].mean()
+
+
+def test_it_begins_where_edges_are_so_long_and_is_whole_at_one_more() -> None:
+    ball = sphere(subdivisions=3)
+    where_torn, low_passed = LowPassWhereTorn(ball, torn=1.5), LowPass(ball.faces, len(ball.vertices))
+    for size, share in ((1.49, 0.0), (2.0, 0.5), (2.6, 1.0)):
+        points = size * ball.vertices
+        wanted = points + share * (low_passed(points, 8) - points)
+        assert np.allclose(where_torn(points, 8), wanted, atol=1e-6)
+    assert np.abs(low_passed(points, 8) - points).max() > 1e-3, "these would tell"

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, leaky_relu
+from torch.nn.functional import interpolate, layer_norm, leaky_relu
 
 SMALLEST_MAP = 16
 _GROUPS = 4
@@ -89,10 +89,22 @@ def normalised(channels: int, normalisation: str) -> nn.Module:
         Another normalisation.
     """
     if normalisation == "group":
-        return nn.GroupNorm(math.gcd(channels, _GROUPS), channels)
+        return RowGroupNorm(math.gcd(channels, _GROUPS), channels)
     if normalisation == "batch":
         return nn.BatchNorm1d(channels)
     raise ValueError(f"normalisation must be 'group' or 'batch', got {normalisation!r}")
+
+
+class RowGroupNorm(nn.GroupNorm):
+    """:class:`torch.nn.GroupNorm` of rows ``[n, channels]``, by layer norms over the groups: less than half the time.
+
+    PyTorch's kernel is made for pictures; that of a row has one pixel.
+    """
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Return ``[n, channels]`` for as much."""
+        groups = rows.reshape(len(rows), self.num_groups, -1)
+        return layer_norm(groups, groups.shape[2:], eps=self.eps).flatten(1) * self.weight + self.bias
 
 
 def _norm(channels: int, normalisation: str) -> nn.Module:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from training.networks.layers.pose_unet import PoseUNet
+from training.networks.layers.pose_unet import PoseUNet, normalised
 
 
 @pytest.mark.parametrize("size", [16, 32, 64, 128])
@@ -32,3 +32,17 @@ def test_what_happens_far_away_is_heard_everywhere() -> None:
     moved = maps.clone()
     moved[..., 0, 0] += 1
     assert (network(moved) - network(maps)).abs()[..., -1, -1].min() > 1e-6
+
+
+@pytest.mark.parametrize(("channels", "groups"), [(12, 4), (6, 2), (3, 1)])
+def test_rows_are_normalised_as_by_group_norm(channels: int, groups: int) -> None:
+    ours, theirs = normalised(channels, "group"), torch.nn.GroupNorm(groups, channels)
+    state = {"weight": torch.randn(channels), "bias": torch.randn(channels)}
+    rows, upstream = torch.randn(2, 50, channels).unbind()
+    gradients = []
+    for norm in (ours, theirs):
+        norm.load_state_dict(state)
+        given = rows.clone().requires_grad_()
+        found = norm(given)
+        gradients.append((found, *torch.autograd.grad(found, [given, *norm.parameters()], upstream)))
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-5, atol=1e-4)
