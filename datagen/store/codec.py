@@ -11,12 +11,12 @@ this a few microseconds.
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import google_crc32c
 import numcodecs.blosc
 import numpy as np
-from numcodecs import Blosc
 from numpy.typing import NDArray
 
 from datagen.common.errors import ShardDamage, ShardMismatch
@@ -86,8 +86,8 @@ class ShardCodec:
         ShardMismatch
             The meshes have other vertices, are more or fewer, or more than a shard has room for.
         """
-        compressor = Blosc(self.compressor, self.level, Blosc.SHUFFLE, typesize=4)
-        chunks = [compressor.encode(mesh) for some in meshes for mesh in self._checked(some)]
+        compress = partial(numcodecs.blosc.compress, cname=self.compressor.encode(), clevel=self.level, typesize=4)
+        chunks = [compress(mesh) for some in meshes for mesh in self._checked(some)]
         if len(chunks) != identities * poses or identities > self.identities or poses > self.poses:
             room = f"with room for {self.identities} x {self.poses}"
             raise ShardMismatch(f"{len(chunks)} meshes instead of {identities} x {poses}, {room}")
