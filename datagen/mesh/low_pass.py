@@ -41,7 +41,7 @@ class LowPass:
 
 
 class LowPassWhereTorn:
-    """The same where vertices come to lie further from their neighbours than at rest; the others stay exactly.
+    """The filter (:class:`LowPass`) where vertices lie further from their neighbours than at rest; the others stay.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class ShardCodec:
         ShardMismatch
             The meshes have other vertices, are more or fewer, or more than a shard has room for.
         """
-        compress = partial(numcodecs.blosc.compress, cname=self.compressor.encode(), clevel=self.level, typesize=4)
+        compress = partial(numcodecs.blosc.compress, cname=self.compressor.encode(), clevel=self.level)
         chunks = [compress(mesh) for some in meshes for mesh in self._checked(some)]
         if len(chunks) != identities * poses or identities > self.identities or poses > self.poses:
             room = f"with room for {self.identities} x {self.poses}"

@@ -53,7 +53,7 @@ class Posed:
     def normals(self) -> NDArray[np.float64]:
         """At the surface's vertices [n, 3], of length one: two parts as predicted, one as the surface has them.
 
-        For loose clothes either alone is further from the scan's; for tight ones its own alone are nearer
+        For loose clothes either alone is further from the scan's; for tight ones the surface's own are nearer
         (docs/results/avatar.md).
         """
         both = self.predicted + _OWN * vertex_normals(self.mesh.vertices, self.mesh.faces)

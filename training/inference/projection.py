@@ -75,7 +75,7 @@ class OntoParts(nn.Module):
         output = self.network(source=source, target=target)
         with full_precision(target):
             drawn = sample(target, surfaces.get("target_surface"))
-            return projected(output, target, self.parts.skinning_weights(target, drawn), drawn)
+            return projected(output, target, self.parts.skinning_weights(drawn, target), drawn)
 
 
 def projected(output: Tensor, target: Tensor, weights: Tensor, drawn: Sample) -> Tensor:

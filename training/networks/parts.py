@@ -189,7 +189,7 @@ class Parts(nn.Module):
             return self._corrected(sample(source, surface), target)
 
     def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
-        """Return what is read off the vertices of a sample, or off all vertices [b, n, 3], in training mode or not."""
+        """Return what is read off a sample's vertices, or off all [b, n, 3] of the meshes that it was drawn from."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
         logits, rest = self.part(features), self.rest(features)
@@ -235,8 +235,8 @@ class Parts(nn.Module):
             cosine = (found.diagonal(dim1=2, dim2=3).sum(2) - 1) / 2
             return torch.rad2deg(cosine.clamp(-1, 1).acos()).square().mean(1).sqrt()
 
-    def skinning_weights(self, vertices: Tensor, drawn: Sample) -> Tensor:
-        """Return the weights [b, n, part] by which vertices [b, n, 3] are posed."""
+    def skinning_weights(self, drawn: Sample, vertices: Tensor) -> Tensor:
+        """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
         return self.part(self._of_all(vertices, drawn, features, known)).softmax(2)

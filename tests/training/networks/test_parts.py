@@ -101,6 +101,24 @@ def test_vertices_beyond_the_sample_hear_what_they_would_of_all_of_it(
     torch.testing.assert_close(inside, network.read(drawn).logits, rtol=0, atol=1e-9)
 
 
+@torch.no_grad()
+def test_meshes_of_a_batch_do_not_mix_where_they_are_more_than_their_samples() -> None:
+    network = lively("parts").double().eval()
+    large = torch.cat([sphere(2500, upper=0.8), 2.3 * sphere(2500, upper=0.3, seed=1)]).double()
+    both = network(source=large, target=large.flip(2))
+    for own in (slice(0, 1), slice(1, 2)):
+        alone = network(source=large[own], target=large.flip(2)[own])
+        torch.testing.assert_close(both[own], alone, rtol=0, atol=1e-11)
+
+
+@torch.no_grad()
+def test_export_takes_meshes_that_are_more_than_their_samples() -> None:
+    network = lively("parts", blocks=1).eval()
+    given = {"source": meshes(1500, seed=1), "target": meshes(1200, seed=2)}
+    exported = torch.export.export(network, (), given).module()
+    torch.testing.assert_close(exported(**given), network(**given), rtol=0, atol=1e-4)
+
+
 def test_a_mesh_that_is_its_own_sample_is_passed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     network, vertices, passed = lively("parts"), meshes(1024, seed=3), []
     assert isinstance(network, Parts)

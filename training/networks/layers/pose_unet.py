@@ -103,7 +103,7 @@ class RowGroupNorm(nn.GroupNorm):
 
     def forward(self, rows: Tensor) -> Tensor:
         """Return ``[n, channels]`` for as much."""
-        groups = rows.reshape(len(rows), self.num_groups, -1)
+        groups = rows.view(len(rows), self.num_groups, self.num_channels // self.num_groups)
         return layer_norm(groups, groups.shape[2:], eps=self.eps).flatten(1) * self.weight + self.bias
 
 

@@ -25,13 +25,13 @@ than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 _MOST = 1024
-_AT_ONCE = 512
-"""Vertices that are not of the sample and lie in one region or in regions beside each other."""
-_REGION = 0.25
+_AT_ONCE, _REGION = 512, 0.25
+"""So many vertices that are not of the sample are told at a time, region after region; the edge of a region, in half the
+longest edge of a mesh' box."""
 _RADIUS = 0.1
 """Of the Gaussian that counts neighbours: about that of an arm."""
 _REACH = 5 * _RADIUS
-"""Further off the Gaussian is below 4e-6, and not worked out."""
+"""Further off the Gaussian is below 4e-6, and need not be worked out."""
 _NODES = 12
 """Of the grid on which all vertices are counted, in half the longest edge of a mesh' box."""
 
@@ -42,12 +42,12 @@ class Surroundings(NamedTuple):
     Attributes
     ----------
     vertices
-        [b, m, 3].
+        Those around which it lies [b, m, 3].
     near
         Gaussian [b, m, c] of their distances from those of the sample; next to nothing where they merely touch.
     columns
-        The numbers of those in the sample [b, c]; None: all of it.
-    every
+        Which of the sample [b, c]; None: all of it.
+    per_mass
         One over the mass that is near each [b, m, 1].
     offsets
         How far [b, m, 3] they lie from the middle of what is near, in units of the Gaussian. It points out of the
@@ -57,12 +57,12 @@ class Surroundings(NamedTuple):
     vertices: Tensor
     near: Tensor
     columns: Tensor | None
-    every: Tensor
+    per_mass: Tensor
     offsets: Tensor
 
     def mean(self, weighted: Tensor) -> Tensor:
-        """Return the mean [b, m, c] of what is near, of the sample's values times its masses [b, k, c]."""
-        return self.every * (self.near @ _among(weighted, self.columns))
+        """Return the mean [b, m, f] of what is near, of the sample's values times its masses [b, k, f]."""
+        return self.per_mass * (self.near @ _among(weighted, self.columns))
 
 
 class Sample(NamedTuple):
@@ -182,38 +182,57 @@ def _with_masses(
 
 
 def others(vertices: Tensor, drawn: Sample) -> Iterator[tuple[Tensor, Surroundings]]:
-    """Yield the vertices of meshes [b, n, 3] that are not in the sample, some at a time, with their numbers [b, m]."""
+    """Yield the vertices that are not in the sample of meshes [b, n, 3], some at a time, with their numbers [b, m].
+
+    They go region by region, so that little of the sample is near any of them; what is out of reach of the box around
+    them is left out. Which vertices share a box depends on their order where they are of one region: a difference of
+    1e-6 in what is read, less than rounding makes.
+    """
     count = vertices.shape[1] - drawn.rows.shape[1]
     if not count:
         return
     x, y, z = (vertices.detach().nan_to_num().clamp(-_BEYOND, _BEYOND) / _REGION).floor().long().unbind(2)
-    region = ((y * 64 + x) * 64 + z).scatter(1, drawn.rows, 1 << 20)
+    region = ((y * 64 + x) * 64 + z).scatter(1, drawn.rows, 1 << 20)  # the sample last: no region has such a number
     for rows in region.argsort(dim=1, stable=True)[:, :count].split(_AT_ONCE, dim=1):  # type: ignore[no-untyped-call]
         some = taken(vertices, rows)
-        columns, told = _within_reach(some, drawn.vertices), None
+        columns, inside = _within_reach(some, drawn.vertices)
+        told = None
         if drawn.surface is not None and drawn.apart is not None:
-            apart = drawn.apart.gather(2, columns[:, None].expand(-1, drawn.apart.shape[1], -1))
-            told = of_cells(apart, drawn.surface.cells.gather(1, rows))
-        near = _near(some, taken(drawn.vertices, columns), told)
+            told = of_cells(_columns_of(drawn.apart, columns), drawn.surface.cells.gather(1, rows))
+        near = _near(some, _among(drawn.vertices, columns), told)
+        if inside is not None and len(inside) > 1:  # a mesh hears what it would hear alone
+            near = near * inside[:, None]
         yield rows, _surroundings(some, near, drawn.vertices, drawn.masses, columns)
 
 
 @torch.no_grad()
-def _within_reach(vertices: Tensor, others: Tensor) -> Tensor:
-    """The numbers [b, c] of at least those others [b, k, 3] that may be near one of the vertices [b, n, 3]."""
+def _within_reach(vertices: Tensor, sampled: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Which of a sample [b, k, 3] may be near one of the vertices [b, m, 3]: their numbers [b, c], and whether they are.
+
+    As many of each mesh as of the one with most. None: all of it, where asking how many would make a GPU wait or cut a
+    graph.
+    """
+    if vertices.is_cuda or torch.compiler.is_compiling():
+        return None, None
     low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
-    away = ((low - others).clamp_min(0) + (others - high).clamp_min(0)).square().sum(dim=2)
-    count = int((away < _REACH**2).sum(dim=1).amax())
-    return away.topk(max(count, 1), dim=1, largest=False).indices
+    away = ((low - sampled).clamp_min(0) + (sampled - high).clamp_min(0)).square().sum(dim=2)
+    inside = away < _REACH**2
+    columns = away.topk(max(int(inside.sum(dim=1).amax()), 1), dim=1, largest=False).indices
+    return columns, inside.gather(1, columns)
+
+
+def _columns_of(apart: Tensor, columns: Tensor | None) -> Tensor:
+    """Columns [b, c] of [b, cell, k]."""
+    return apart if columns is None else apart.gather(2, columns[:, None].expand(-1, apart.shape[1], -1))
 
 
 def _surroundings(
-    vertices: Tensor, near: Tensor, others: Tensor, masses: Tensor, columns: Tensor | None = None
+    vertices: Tensor, near: Tensor, sampled: Tensor, masses: Tensor, columns: Tensor | None = None
 ) -> Surroundings:
-    weighted = masses[..., None] * torch.cat([others, torch.ones_like(others[..., :1])], dim=2)
+    weighted = masses[..., None] * torch.cat([sampled, torch.ones_like(sampled[..., :1])], dim=2)
     sums = near @ _among(weighted, columns)
-    every = 1 / sums[..., 3:].clamp_min(1e-12)
-    return Surroundings(vertices, near, columns, every, (vertices - every * sums[..., :3]) * (2 / _RADIUS))
+    per_mass = 1 / sums[..., 3:].clamp_min(1e-12)
+    return Surroundings(vertices, near, columns, per_mass, (vertices - per_mass * sums[..., :3]) * (2 / _RADIUS))
 
 
 def _among(values: Tensor, columns: Tensor | None) -> Tensor:

@@ -9,7 +9,7 @@ from tests.support.samples import offsets_of
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks.layers.sampling import sample
-from training.networks.layers.surface import joined, of_cells, surface_of
+from training.networks.layers.surface import Surface, joined, of_cells, surface_of
 from training.networks.parts import Parts
 
 
@@ -103,6 +103,35 @@ def test_offsets_of_one_finger_are_not_the_others() -> None:
     far = vertices[0, :, 0] < 0.4
     assert (aside[0][far & upper].mean() - aside[0][far & ~upper].mean()).abs() > 0.1  # away from each other
     assert (aside[1][far & upper].mean() - aside[1][far & ~upper].mean()).abs() < 0.02  # as if it were alone
+
+
+def two_pins() -> tuple[torch.Tensor, Surface]:
+    """Hairpins of 3,000 vertices, thinner and thicker, and what is near along them."""
+    pins = [hairpin(300), hairpin(300, gap=0.3)]
+    told = joined([surface_of(pin.vertices, edges_of(pin.faces)) for pin in pins])
+    return torch.stack([torch.from_numpy(pin.vertices) for pin in pins]), told
+
+
+def test_offsets_are_from_the_mean_of_what_is_near_along_the_surface() -> None:
+    vertices, told = two_pins()
+    drawn = sample(vertices, told)
+    assert not (drawn.masses > 0).all() and (drawn.masses > 0).any()
+    away = torch.cdist(vertices, drawn.vertices)
+    near = (-0.5 * (away / 0.1).square()).exp() * drawn.masses[:, None]
+    cells = told.cells.gather(1, drawn.rows)
+    for pin in range(2):
+        near[pin] *= torch.where(told.near[pin][told.cells[pin]][:, cells[pin]], 1.0, 1e-4)
+    middle = near @ drawn.vertices / near.sum(2, keepdim=True)
+    torch.testing.assert_close(offsets_of(vertices, drawn), (vertices - middle) * 20, rtol=0, atol=1e-3)
+
+
+def test_a_sample_that_did_not_move_is_what_it_was() -> None:
+    vertices, told = two_pins()
+    drawn = sample(vertices, told)
+    again = drawn.moved(drawn.vertices)
+    assert not (drawn.masses > 0).all()
+    torch.testing.assert_close(again.masses, drawn.masses)
+    torch.testing.assert_close(offsets_of(vertices, again), offsets_of(vertices, drawn))
 
 
 def test_a_mesh_of_a_batch_is_told_what_it_is_told_alone() -> None:
