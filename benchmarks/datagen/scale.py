@@ -100,7 +100,7 @@ def simulate(work: Work, tasks: int, *, nodes: int, cpus: int = 16) -> Outcome:
 
 # Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md); DRIVER for a task and
 # FINISH for a shard (benchmarks.datagen.driver).
-DRIVER, FINISH = 0.836e-3, 0.085e-3
+DRIVER, FINISH = 0.495e-3, 0.036e-3
 # Assumed: a node of 16 CPUs with 12.5 Gbit/s; 3,500 objects written a second below one prefix, whatever their size.
 CPUS, NETWORK, PUTS = 16, 12.5e9 / 8, 3500
 # Assumed prices in dollars: an hour of a node, a terabyte kept for a month, a million objects written.
@@ -134,10 +134,10 @@ class Body:
 
 
 BODIES = {
-    "615 vertices, 100 a shard": Body(7732, 6600, 100),
-    "615 vertices, 4,000 a shard": Body(7732, 6600, 4000),
-    "13,718 vertices, 100 a shard": Body(1800, 132_500, 100),
-    "13,718 vertices, 400 a shard": Body(1800, 132_500, 400),
+    "615 vertices, 100 a shard": Body(18_500, 6600, 100),
+    "615 vertices, 4,000 a shard": Body(18_500, 6600, 4000),
+    "13,718 vertices, 100 a shard": Body(3040, 132_500, 100),
+    "13,718 vertices, 400 a shard": Body(3040, 132_500, 400),
 }
 
 
