@@ -111,7 +111,7 @@ def orthogonal(matrices: Tensor) -> Tensor:
     wide = wide / wide.norm(dim=(1, 2), keepdim=True).clamp_min(1e-12)
     for a, b, c in _ITERATIONS:
         squares = wide @ wide.mT
-        wide = a * wide + (b * squares + c * squares @ squares) @ wide
+        wide = torch.baddbmm(wide, torch.baddbmm(squares, squares, squares, beta=b, alpha=c), wide, beta=a)
     return wide if matrices.shape[1] <= matrices.shape[2] else wide.mT
 
 
