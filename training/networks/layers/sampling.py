@@ -26,8 +26,8 @@ _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 _MOST = 1024
 _AT_ONCE, _REGION = 512, 0.25
-"""So many vertices that are not of the sample are told at a time, region after region; the edge of a region, in half the
-longest edge of a mesh' box."""
+"""So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
+longest edge of a mesh' box being 1."""
 _RADIUS = 0.1
 """Of the Gaussian that counts neighbours: about that of an arm."""
 _REACH = 5 * _RADIUS
@@ -207,10 +207,10 @@ def others(vertices: Tensor, drawn: Sample) -> Iterator[tuple[Tensor, Surroundin
 
 @torch.no_grad()
 def _within_reach(vertices: Tensor, sampled: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Which of a sample [b, k, 3] may be near one of the vertices [b, m, 3]: their numbers [b, c], and whether they are.
+    """Which of a sample [b, k, 3] may be near some vertices [b, m, 3]: numbers [b, c], and of which this is so [b, c].
 
-    As many of each mesh as of the one with most. None: all of it, where asking how many would make a GPU wait or cut a
-    graph.
+    There are as many for each mesh as for the one with most. None: all of it, where asking how many would make a GPU
+    wait or cut a graph.
     """
     if vertices.is_cuda or torch.compiler.is_compiling():
         return None, None
