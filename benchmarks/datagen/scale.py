@@ -98,8 +98,8 @@ def simulate(work: Work, tasks: int, *, nodes: int, cpus: int = 16) -> Outcome:
     return Outcome(now + tasks * work.finish, {name: total / now for name, total in totals.items()})
 
 
-# Measured: meshes/s of whole shards on one core and kB a mesh (docs/results/benchmarks.md); DRIVER for a task and
-# FINISH for a shard (benchmarks.datagen.driver).
+# Measured (docs/scale.md): meshes/s of whole shards on one core and bytes a mesh (benchmarks.datagen.generation);
+# DRIVER for a task and FINISH for a shard (benchmarks.datagen.driver).
 DRIVER, FINISH = 0.495e-3, 0.036e-3
 # Assumed: a node of 16 CPUs with 12.5 Gbit/s; 3,500 objects written a second below one prefix, whatever their size.
 CPUS, NETWORK, PUTS = 16, 12.5e9 / 8, 3500

@@ -44,7 +44,8 @@ class Surroundings(NamedTuple):
     vertices
         Those around which it lies [b, m, 3].
     near
-        Gaussian [b, m, c] of their distances from those of the sample; next to nothing where they merely touch.
+        Gaussian [b, m, c] of their distances from those of the sample; next to nothing where they merely touch, zero
+        in columns that only another mesh of the batch needs.
     columns
         Which of the sample [b, c]; None: all of it.
     per_mass
@@ -185,8 +186,8 @@ def others(vertices: Tensor, drawn: Sample) -> Iterator[tuple[Tensor, Surroundin
     """Yield the vertices that are not in the sample of meshes [b, n, 3], some at a time, with their numbers [b, m].
 
     They go region by region, so that little of the sample is near any of them; what is out of reach of the box around
-    them is left out. Which vertices share a box depends on their order where they are of one region: a difference of
-    1e-6 in what is read, less than rounding makes.
+    them is left out, but on a GPU and in a graph. Which vertices share a box depends on their order where they are of
+    one region: a difference of some 1e-6 in what is read, less than rounding makes.
     """
     count = vertices.shape[1] - drawn.rows.shape[1]
     if not count:
@@ -239,11 +240,11 @@ def _among(values: Tensor, columns: Tensor | None) -> Tensor:
     return values if columns is None else taken(values, columns)
 
 
-def _near(vertices: Tensor, others: Tensor, apart: Tensor | None) -> Tensor:
-    """Gaussian [b, n, k] of the distance of vertices [b, n, 3] from others [b, k, 3], less where they lie ``apart``,
-    which is written over.
+def _near(vertices: Tensor, sampled: Tensor, apart: Tensor | None) -> Tensor:
+    """Gaussian [b, n, k] of the distance of vertices [b, n, 3] from those of a sample [b, k, 3], less where they lie
+    ``apart``, which is written over.
     """
-    one, other = vertices / _RADIUS, others / _RADIUS
+    one, other = vertices / _RADIUS, sampled / _RADIUS
     unit = torch.ones_like(one[..., :1]), torch.ones_like(other[..., :1])
     halves = -0.5 * one.square().sum(2, keepdim=True), -0.5 * other.square().sum(2, keepdim=True)
     left, right = torch.cat([one, halves[0], unit[0]], dim=2), torch.cat([other, unit[1], halves[1]], dim=2).mT

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from datagen.mesh.geometry import Mesh, edges_of
 from tests.support.samples import offsets_of
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
+from training.networks.layers import sampling
 from training.networks.layers.sampling import sample
 from training.networks.layers.surface import Surface, joined, of_cells, surface_of
 from training.networks.parts import Parts
@@ -123,6 +125,20 @@ def test_offsets_are_from_the_mean_of_what_is_near_along_the_surface() -> None:
         near[pin] *= torch.where(told.near[pin][told.cells[pin]][:, cells[pin]], 1.0, 1e-4)
     middle = near @ drawn.vertices / near.sum(2, keepdim=True)
     torch.testing.assert_close(offsets_of(vertices, drawn), (vertices - middle) * 20, rtol=0, atol=1e-3)
+
+
+def test_a_gpu_hears_all_of_the_sample_and_is_asked_for_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = lively("parts", dtype=torch.float64)
+    assert isinstance(network, Parts)
+    vertices, told = two_pins()
+    drawn = sample(vertices, told)
+    expected = network.read(drawn, vertices)
+    monkeypatch.setattr(sampling, "_within_reach", lambda *_: (None, None))  # as it answers there
+    for one, other in zip(network.read(drawn, vertices), expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
+    with FakeTensorMode(allow_non_fake_inputs=True) as fake:
+        unknown, surface = fake.from_tensor(vertices), Surface(*map(fake.from_tensor, told))
+        assert network.read(sample(unknown, surface), unknown).rest.shape == vertices.shape
 
 
 def test_a_sample_that_did_not_move_is_what_it_was() -> None:
