@@ -165,23 +165,24 @@ def memory(topology: str) -> None:
 
 
 def scaling(topology: str, identities: int) -> None:
-    """Whole shards a second on one and on two Ray workers, once the workers have loaded the body."""
+    """Whole shards a second on one and on two Ray workers, which have made as many once before."""
     import ray
 
     from datagen.generate import ray_runner
     from datagen.generate.shards import batches
 
-    rates = []
+    recipe, rates = recipe_of(topology, identities), list[float]()
     for workers in (1, 2):
         ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
-        with tempfile.TemporaryDirectory() as folder:
-            for name, count in (("warm", 8), ("timed", identities)):
-                recipe, url = recipe_of(topology, count), f"{folder}/{name}.zarr"
+        for _ in ("warm", "timed"):
+            with tempfile.TemporaryDirectory() as folder:
+                url = f"{folder}/made.zarr"
                 wanted = [(shard, None) for shard in prepare(url, recipe).shards()]
                 tasks = [(url, recipe, some) for some in batches(recipe, wanted)]
                 began = time.perf_counter()
                 meshes = sum(row.rows for rows in ray_runner(ensure_shards, tasks) for row in rows)
-            rates.append(meshes / (time.perf_counter() - began))
+                rate = meshes / (time.perf_counter() - began)
+        rates.append(rate)
         ray.shutdown()
     print(
         f"\nRay workers, {topology}: one {rates[0]:,.0f} meshes/s, two {rates[1]:,.0f} meshes/s, "
