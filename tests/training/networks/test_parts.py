@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from datagen.mesh.rig import part_transforms
-from tests.support.samples import offsets_of
+from tests.support.shapes.samples import offsets_of
 from tests.support.three_networks import lively, meshes
 from training.networks import build_network
 from training.networks.layers import sampling

@@ -6,7 +6,7 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from datagen.mesh.geometry import Mesh, edges_of
-from tests.support.samples import offsets_of
+from tests.support.shapes.samples import offsets_of
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks.layers import sampling
