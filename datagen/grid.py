@@ -249,15 +249,17 @@ class GridArray:
         """The place of the shard that is ``row`` shards along the identities and ``column`` along the poses."""
         return SPLITS.index(self.split), self.topology, row, column
 
-    def shards(self) -> Iterator[Shard]:
-        """All shards, in the order of their places; one never holds meshes of two steps."""
+    def shards(self, wanted: NDArray[np.bool_] | None = None) -> Iterator[Shard]:
+        """All shards or the ``wanted`` [shard], in the order of their places; one never holds meshes of two steps."""
         height, width = self.room
-        poses = [_without_holes(self.poses[start : start + width]) for start in range(0, len(self.poses), width)]
-        for row, start in enumerate(range(0, len(self.identities), height)):
-            members = tuple(_without_holes(self.identities[start : start + height]))
-            for column, held in enumerate(poses):
-                span = range(held[0], held[-1] + 1)
-                yield Shard(self.place(row, column), members, span, self.vertices, self.room)
+        held = [_without_holes(self.poses[start : start + width]) for start in range(0, len(self.poses), width)]
+        spans = [range(poses[0], poses[-1] + 1) for poses in held]
+        which = np.ones(self.shard_count, bool) if wanted is None else wanted
+        for row, columns in enumerate(which.reshape(-1, len(spans))):
+            if columns.any():
+                members = tuple(_without_holes(self.identities[row * height : (row + 1) * height]))
+                for column in np.flatnonzero(columns).tolist():
+                    yield Shard(self.place(row, column), members, spans[column], self.vertices, self.room)
 
     def places(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """The place [shard, 4] and the number of meshes [shard] of its shards; it makes no list of these."""
@@ -337,9 +339,11 @@ class GridArrays:
         found = [array.places() for array in self.arrays]
         return np.concatenate([places for places, _ in found]), np.concatenate([rows for _, rows in found])
 
-    def shards(self) -> list[Shard]:
-        """All shards, ordered by place."""
-        return [shard for array in self.arrays for shard in array.shards()]
+    def shards(self, wanted: NDArray[np.bool_] | None = None) -> list[Shard]:
+        """All shards or the ``wanted`` [shard] of them, ordered by place."""
+        which = np.ones(self.shard_count, bool) if wanted is None else wanted
+        each = np.split(which, np.cumsum([array.shard_count for array in self.arrays])[:-1])
+        return [shard for array, some in zip(self.arrays, each, strict=True) for shard in array.shards(some)]
 
 
 def _repeated(counts: Sequence[int]) -> NDArray[np.intp]:

@@ -7,9 +7,10 @@ the bytes come out the same.
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 
+import numpy as np
 from pydantic import ValidationError
 
 from datagen.bodies import load_body
@@ -17,7 +18,7 @@ from datagen.common.errors import BodyError, DatasetError, DsffnetError, RecipeE
 from datagen.generate.plan import assets_of, prepare
 from datagen.generate.runners import Progress, Runner, Task, closable, inline, ray_runner, unseen
 from datagen.generate.shards import Wanted, batches, ensure_shards, make_shard
-from datagen.grid import Grid, Place
+from datagen.grid import Grid, GridArrays
 from datagen.recipe import DatasetRecipe, Growth
 from datagen.recipe.text import faults_text
 from datagen.sizes import require_memory
@@ -135,7 +136,8 @@ def append(
         if grown != stored:
             before = open_dataset(url)  # an unfinished one must be finished first, and says how
             _make_missing(grown, url, run, progress, before=before)
-        elif not _complete(url, stored):
+            return Dataset(url, open_group(url))  # of its shards the old were looked at then, the new were now
+        if not _complete(url, stored):
             _make_missing(stored, url, run, progress)
     return open_dataset(url)
 
@@ -198,53 +200,69 @@ def _make_missing(
     faults: Sequence[Fault] = (),
 ) -> None:
     """Make what is missing of a dataset, which grows from ``before``, or of which ``faults`` were found."""
-    known = SoFar(before.manifest) if before else known_shards(url, {fault.path for fault in faults})
+    found = before.committed if before else None
+    known = SoFar(found.table) if found else known_shards(url, {fault.path for fault in faults})
     lost = [fault.path for fault in faults if not fault.shard]
     arrays = prepare(url, recipe, run=run, progress=progress, before=before, lost=lost, so_far=known)
     if faults:  # before anything is made: a run after this one must know what is faulty
         save(url, recipe, known)
-    sound, rows, missing = {row.place for row in known.sound}, list[ManifestRow](), list[Wanted]()
-    doubted = {row.place: row for row in (*known.sound, *known.doubted)}
-    for shard in arrays.shards():
-        row = doubted.get(shard.place)
-        if row is not None and row.place in sound and row.rows == shard.rows:
-            rows.append(doubted.pop(shard.place))
-        else:
-            missing.append((shard, row.blake3 if row else None))
+    known, missing = _divided(arrays, known)
     tasks = [(url, recipe, some) for some in batches(recipe, missing)]
-    done, kept = sum(row.rows for row in rows), len(rows) if before else 0
-    with closing(closable(run(ensure_shards, tasks))) as ran, _saving(url, recipe, rows, doubted) as add:
+    done, shards = int(known.sound["rows"].sum(dtype=int)), _Shards(url, recipe, known)
+    with closing(closable(run(ensure_shards, tasks))) as ran, shards.saved():
         results = ((sum(row.rows for row in made), made) for made in ran)
         for made in progress(results, unit="mesh", total=Grid(recipe).mesh_count, done=done):
-            add(made)
-    finish(url, recipe, rows, written=rows[kept:])
+            shards.add(made)
+    table = shards.so_far().sound
+    finish(url, recipe, table, written=table[len(known.sound) :] if before else None)
 
 
-@contextmanager
-def _saving(
-    url: str, recipe: DatasetRecipe, rows: list[ManifestRow], doubted: dict[Place, ManifestRow]
-) -> Iterator[Callable[[list[ManifestRow]], None]]:
-    """Collect rows, and save them now and then and where the block is left early."""
-    due = time.monotonic() + _SAVE_SECONDS
+def _divided(arrays: GridArrays, known: SoFar) -> tuple[SoFar, list[Wanted]]:
+    """What is known of an array's shards, those that are no others sound; and the shards that are to be made."""
+    written, (places, rows) = known.written, arrays.places()
+    numbers = {tuple(place): number for number, place in enumerate(written["place"].tolist())}
+    number = np.array([numbers.get(tuple(place), -1) for place in places.tolist()], int)
+    there = (number < len(known.sound)) & (np.append(written["rows"], -1)[number] == rows)
+    hashes = [written["blake3"][at].tobytes().hex() if at >= 0 else None for at in number[~there].tolist()]
+    missing = list(zip(arrays.shards(~there), hashes, strict=True))
+    return SoFar(written[number[there]], np.delete(written, number[there])), missing
 
-    def add(made: list[ManifestRow]) -> None:
-        nonlocal due
-        for row in made:
-            rows.append(row)
-            doubted.pop(row.place, None)
-        if (began := time.monotonic()) >= due:
-            save(url, recipe, SoFar(rows, [*doubted.values()]))
+
+class _Shards:
+    """The shards of a dataset that is being made, saved now and then."""
+
+    def __init__(self, url: str, recipe: DatasetRecipe, known: SoFar) -> None:
+        self._url, self._recipe = url, recipe
+        self._so_far, self._made = known, list[ManifestRow]()
+        self._due = time.monotonic() + _SAVE_SECONDS
+
+    def add(self, made: list[ManifestRow]) -> None:
+        """Take the rows of some that were made."""
+        self._made += made
+        if (began := time.monotonic()) >= self._due:
+            self._save()
             now = time.monotonic()
-            due = now + max(_SAVE_SECONDS, _SAVE_SHARE * (now - began))
+            self._due = now + max(_SAVE_SECONDS, _SAVE_SHARE * (now - began))
 
-    try:
-        yield add
-    except StorageError:  # nothing can be written
-        raise
-    except BaseException:
-        with suppress(DsffnetError, OSError):  # the first error is the one to report
-            save(url, recipe, SoFar(rows, [*doubted.values()]))
-        raise
+    def so_far(self) -> SoFar:
+        """All of them by now."""
+        self._so_far, self._made = self._so_far.with_made(self._made), []
+        return self._so_far
+
+    def _save(self) -> None:
+        save(self._url, self._recipe, self.so_far())
+
+    @contextmanager
+    def saved(self) -> Iterator[None]:
+        """Save them where the block is left early."""
+        try:
+            yield
+        except StorageError:  # nothing can be written
+            raise
+        except BaseException:
+            with suppress(DsffnetError, OSError):  # the first error is the one to report
+                self._save()
+            raise
 
 
 def repair(

@@ -7,9 +7,8 @@ a dataset can change unnoticed. While a dataset is made, one object beside it sa
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -26,23 +25,26 @@ from datagen.store.objects import list_small_objects, read_bytes, write_bytes
 from datagen.store.schema import MOST_SHARDS, attributes_of
 
 SEAL = "attributes_sha256"
-_COLUMNS = {
-    "place": ("int32", (4,), ("shard", "axis")),
-    "rows": ("int32", (), ("shard",)),
-    "bytes": ("int64", (), ("shard",)),
-    "blake3": ("uint8", (32,), ("shard", "byte")),
-    "extent": ("float32", (2, 3), ("shard", "bound", "coordinate")),
+_DIMENSIONS = {
+    "place": ("shard", "axis"),
+    "rows": ("shard",),
+    "bytes": ("shard",),
+    "blake3": ("shard", "byte"),
+    "extent": ("shard", "bound", "coordinate"),
 }
-"""Arrays with a row for each shard: type, shape of a row, dimension names."""
+"""Of the arrays that have a row for each shard."""
+SHARD = np.dtype(
+    [("place", "<i4", 4), ("rows", "<i4"), ("bytes", "<i8"), ("blake3", "u1", 32), ("extent", "<f4", (2, 3))]
+)
+"""A shard in a table: what a :class:`ManifestRow` says of it, without an object of its own."""
+ShardTable = NDArray[np.void]
+"""Of ``SHARD`` [shard]."""
 _MOST = 10**9
 """Of a number in a path."""
 _OBJECTS = "manifest/object_sha256"
-_PLACE = attrgetter("place")
 SO_FAR = "manifest/so_far"
 """The object that lists the shards of a dataset in the making; the manifest has it all."""
-_SO_FAR_ROW = np.dtype(
-    [("sound", "u1"), *((name, np.dtype(it).newbyteorder("<"), of) for name, (it, of, _) in _COLUMNS.items())]
-)
+_SO_FAR_ROW = np.dtype([("sound", "u1"), *((name, SHARD[name]) for name in _DIMENSIONS)])
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class Manifest:
     Attributes
     ----------
     columns
-        Of its shards, ordered by place: an array [shard, ...] for each name of ``_COLUMNS``.
+        Of its shards, ordered by place: an array [shard, ...] for each field of ``SHARD``.
     objects
         The sha256 of every other object by its path.
     """
@@ -101,20 +103,24 @@ class Manifest:
     objects: Mapping[str, str]
 
     @cached_property
+    def table(self) -> ShardTable:
+        """All shards."""
+        return _table_of(self.columns)
+
+    @property
     def shards(self) -> list[ManifestRow]:
         """One row a shard."""
         return [
             ManifestRow(tuple(place), rows, size, bytes(digest).hex(), tuple(low), tuple(high))
             for place, rows, size, digest, (low, high) in zip(
-                *(self.columns[name].tolist() for name in _COLUMNS), strict=True
+                *(self.columns[name].tolist() for name in _DIMENSIONS), strict=True
             )
         ]
 
     @cached_property
     def sizes(self) -> dict[str, int]:
         """Bytes of each shard by its path."""
-        places, sizes = self.columns["place"].tolist(), self.columns["bytes"].tolist()
-        return {shard_path(place): size for place, size in zip(places, sizes, strict=True)}
+        return dict(zip(paths_of(self.table), self.table["bytes"].tolist(), strict=True))
 
     @property
     def object_hashes(self) -> NDArray[np.uint8]:
@@ -129,49 +135,80 @@ class Manifest:
         return found.hexdigest()
 
 
-def manifest_of(rows: Sequence[ManifestRow], objects: Mapping[str, str]) -> Manifest:
+def manifest_of(table: ShardTable, objects: Mapping[str, str]) -> Manifest:
     """The manifest of these shards, in any order, and objects."""
-    ordered = sorted(rows, key=_PLACE)
+    ordered = table[_order(table)]
+    return Manifest({name: np.ascontiguousarray(ordered[name]) for name in _DIMENSIONS}, objects)
+
+
+def _order(table: ShardTable) -> NDArray[np.intp]:
+    """By place."""
+    return np.lexsort(table["place"].T[::-1])
+
+
+def table_of(rows: Sequence[ManifestRow]) -> ShardTable:
+    """Shards as a table, in their order."""
     columns: dict[str, Any] = {
-        "place": [row.place for row in ordered],
-        "rows": [row.rows for row in ordered],
-        "bytes": [row.bytes for row in ordered],
-        "blake3": _hashes(row.blake3 for row in ordered),
-        "extent": [(row.minimum, row.maximum) for row in ordered],
+        "place": [row.place for row in rows],
+        "rows": [row.rows for row in rows],
+        "bytes": [row.bytes for row in rows],
+        "blake3": _hashes(row.blake3 for row in rows),
+        "extent": [(row.minimum, row.maximum) for row in rows],
     }
-    types = _COLUMNS.items()
-    return Manifest({name: np.array(columns[name], it).reshape(-1, *row) for name, (it, row, _) in types}, objects)
+    return _table_of({name: np.reshape(values, (-1, *SHARD[name].shape)) for name, values in columns.items()})
+
+
+def _table_of(columns: Mapping[str, Any]) -> ShardTable:
+    table = np.empty(len(columns["rows"]), SHARD)
+    for name in _DIMENSIONS:
+        table[name] = columns[name]
+    return table
+
+
+def paths_of(table: ShardTable) -> list[str]:
+    """The path of each shard's object."""
+    return [shard_path(place) for place in table["place"].tolist()]
 
 
 def _hashes(digests: Iterable[str]) -> NDArray[np.uint8]:
     return np.frombuffer(bytes.fromhex("".join(digests)), np.uint8).reshape(-1, 32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SoFar:
     """The shards of a dataset that is being made.
 
     Attributes
     ----------
     sound
-        Rows of those that are there.
+        Those that are there.
     doubted
-        Rows of those that have been written before and are to be made again, as the same bytes.
+        Those that have been written before and are to be made again, as the same bytes.
     """
 
-    sound: Sequence[ManifestRow] = ()
-    doubted: Sequence[ManifestRow] = ()
+    sound: ShardTable = field(default_factory=lambda: np.empty(0, SHARD))
+    doubted: ShardTable = field(default_factory=lambda: np.empty(0, SHARD))
+
+    @property
+    def written(self) -> ShardTable:
+        """All of them."""
+        return np.concatenate([self.sound, self.doubted])
+
+    def with_made(self, rows: Sequence[ManifestRow]) -> "SoFar":
+        """The same once some shards were made, doubted ones among them."""
+        made = {row.place for row in rows}
+        again = np.array([tuple(place) in made for place in self.doubted["place"].tolist()], bool)
+        return SoFar(np.concatenate([self.sound, table_of(rows)]), self.doubted[~again])
 
 
 def put_so_far(group: zarr.Group, so_far: SoFar) -> None:
     """Keep it as one object, whole or not at all, while the manifest stays what was committed."""
-    sound = {row.place for row in so_far.sound}
-    ordered = sorted([*so_far.sound, *so_far.doubted], key=_PLACE)
-    table = np.zeros(len(ordered), _SO_FAR_ROW)
-    table["sound"] = [row.place in sound for row in ordered]
-    for name, values in manifest_of(ordered, {}).columns.items():
-        table[name] = values
-    content = table.tobytes()
+    written = so_far.written
+    table = np.empty(len(written), _SO_FAR_ROW)
+    table["sound"] = np.arange(len(written)) < len(so_far.sound)
+    for name in _DIMENSIONS:
+        table[name] = written[name]
+    content = table[_order(written)].tobytes()
     write_bytes(group, SO_FAR, hashlib.sha256(content).digest() + content)
 
 
@@ -193,16 +230,13 @@ def read_so_far(group: zarr.Group) -> SoFar | None:
         raise ValueError(SO_FAR)
     table = np.frombuffer(content[32:], _SO_FAR_ROW)
     _require_places(table["place"])
-    rows = Manifest({name: table[name] for name in _COLUMNS}, {}).shards
-    both: tuple[list[ManifestRow], list[ManifestRow]] = [], []
-    for row, sound in zip(rows, table["sound"], strict=True):
-        both[not sound].append(row)
-    return SoFar(*both)
+    shards, sound = _table_of({name: table[name] for name in _DIMENSIONS}), table["sound"] > 0
+    return SoFar(shards[sound], shards[~sound])
 
 
 def commit(
     group: zarr.Group,
-    rows: Sequence[ManifestRow],
+    table: ShardTable,
     attributes: dict[str, Any],
     *,
     objects: Mapping[str, str] | None = None,
@@ -212,11 +246,11 @@ def commit(
     ``objects`` are those of the manifest before, where none but shards has been written since.
     """
     hashes = objects or {path: _sha256(read_bytes(group, path) or b"") for path in _hashed_objects(group)}
-    manifest = manifest_of(rows, hashes)
+    manifest = manifest_of(table, hashes)
     put_group(group, "manifest", {"objects": list(hashes)})
     put_array(group, _OBJECTS, manifest.object_hashes, ("object", "byte"))
     for name, values in manifest.columns.items():
-        put_array(group, f"manifest/{name}", values, _COLUMNS[name][2])
+        put_array(group, f"manifest/{name}", values, _DIMENSIONS[name])
     others = {name: value for name, value in attributes_of(group).items() if name not in ("manifest_sha256", SEAL)}
     stated = {**others, **attributes, "manifest_sha256": manifest.digest()}
     group.attrs.put({**stated, SEAL: _digest(stated)})  # these two last, whenever they were written first
@@ -257,8 +291,8 @@ def stored_manifest(group: zarr.Group) -> Manifest:
     if count > MOST_SHARDS:
         raise ValueError(f"{count:,} shards")
     columns = {
-        name: read_array(group, f"manifest/{name}", dtype, (count, *shape))
-        for name, (dtype, shape, _) in _COLUMNS.items()
+        name: read_array(group, f"manifest/{name}", SHARD[name].base.name, (count, *SHARD[name].shape))
+        for name in _DIMENSIONS
     }
     _require_places(columns["place"])
     return Manifest(columns, {path: sha256.tobytes().hex() for path, sha256 in zip(paths, hashes, strict=True)})

@@ -17,6 +17,7 @@ from datagen.store.attributes import attributes_fault
 from datagen.store.manifest import (
     Manifest,
     ManifestRow,
+    SoFar,
     changed_objects,
     covers,
     is_sealed,
@@ -50,7 +51,7 @@ def find_faults(url: str, *, progress: FaultProgress = lambda shards, total: sha
     """
     group = open_group(url)
     check_version(url, group)
-    dataset, manifest = Dataset(url, group), read_manifest(group) or manifest_of([], {})
+    dataset, manifest = Dataset(url, group), read_manifest(group) or manifest_of(SoFar().written, {})
     arrays = _arrays(dataset)
     total = arrays.shard_count if arrays else len(manifest.shards)
     yield from filter(None, progress(_shard_faults(dataset, manifest, arrays), total))

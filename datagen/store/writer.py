@@ -33,10 +33,12 @@ from datagen.store.manifest import (
     SEAL,
     SO_FAR,
     ManifestRow,
+    ShardTable,
     SoFar,
     changed_objects,
     commit,
     is_sealed,
+    paths_of,
     put_so_far,
     read_manifest,
     read_so_far,
@@ -181,7 +183,7 @@ def begin(
                 delete_object(group, path)
         _put_arrays(group, plan)
         if _is_building(as_it_is_now := open_group(url, mode="r+")):
-            commit(as_it_is_now, [*so_far.sound, *so_far.doubted], {})
+            commit(as_it_is_now, so_far.written, {})
 
 
 def _is_building(group: zarr.Group) -> bool:
@@ -343,19 +345,24 @@ def known_shards(url: str, faulty: Collection[str] = ()) -> SoFar:
     except NoDataset:
         return SoFar()
     manifest = read_manifest(group)
-    so_far = SoFar(manifest.shards if manifest else ())
+    so_far = SoFar(manifest.table) if manifest else SoFar()
     try:
         so_far = (read_so_far(group) if _is_building(group) else None) or so_far
     except ValueError:
         so_far = SoFar(doubted=so_far.sound)
     believed = is_sealed(group) or SEAL not in attributes_of(group)
     if not believed or any(path == "zarr.json" or path.startswith("manifest/") for path in faulty):
-        return SoFar(doubted=[*so_far.sound, *so_far.doubted])
-    sizes = stored_sizes(group, [row.path for row in so_far.sound if row.path not in faulty])
-    both: tuple[list[ManifestRow], list[ManifestRow]] = [], [*so_far.doubted]
-    for row in so_far.sound:
-        both[sizes.get(row.path) != row.bytes].append(row)
-    return SoFar(*both)
+        return SoFar(doubted=so_far.written)
+    there = _whole(group, so_far.sound, paths_of(so_far.sound), but=faulty)
+    return SoFar(so_far.sound[there], np.concatenate([so_far.doubted, so_far.sound[~there]]))
+
+
+def _whole(
+    group: zarr.Group, table: ShardTable, paths: Sequence[str], *, but: Collection[str] = ()
+) -> NDArray[np.bool_]:
+    """Which shards [shard] of these paths are there, of the size that was written, ``but`` for some."""
+    sizes = stored_sizes(group, [path for path in paths if path not in but])
+    return np.array([sizes.get(path) == size for path, size in zip(paths, table["bytes"].tolist(), strict=True)], bool)
 
 
 def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
@@ -366,15 +373,13 @@ def save(url: str, recipe: DatasetRecipe, so_far: SoFar) -> None:
             put_so_far(group, so_far)
 
 
-def finish(
-    url: str, recipe: DatasetRecipe, rows: Sequence[ManifestRow], *, written: Sequence[ManifestRow] | None = None
-) -> None:
+def finish(url: str, recipe: DatasetRecipe, table: ShardTable, *, written: ShardTable | None = None) -> None:
     """Commit the manifest, the statistics and ``status: complete``; remove what killed writers left of their files.
 
     Parameters
     ----------
-    rows
-        Of all shards.
+    table
+        All shards.
     written
         Of those to look at, their sizes and what lies beside them: where a complete dataset grew, the new ones, as
         the others were looked at when it was opened. By default all.
@@ -385,24 +390,23 @@ def finish(
         Meanwhile the dataset was begun anew by another recipe, or a shard is not what its task wrote.
     """
     statistics = {
-        "meshes": sum(row.rows for row in rows),
-        "bytes": sum(row.bytes for row in rows),
-        "minimum": np.min([row.minimum for row in rows], axis=0).tolist(),
-        "maximum": np.max([row.maximum for row in rows], axis=0).tolist(),
+        "meshes": int(table["rows"].sum(dtype=np.int64)),
+        "bytes": int(table["bytes"].sum()),
+        "minimum": table["extent"][:, 0].min(axis=0).tolist(),
+        "maximum": table["extent"][:, 1].max(axis=0).tolist(),
     }
     with _writing(url):
         group = ShardWriter(url, recipe).group
-        written = rows if written is None else written
-        sizes = stored_sizes(group, [row.path for row in written])
-        for row in written:
-            if sizes.get(row.path) != row.bytes:
-                raise DatasetError(f"{url}: shard {row.path} was changed by somebody else. Run the same command again")
-        for path in list_leftovers(group, [row.path for row in written]):
+        written = table if written is None else written
+        paths = paths_of(written)
+        for place in np.flatnonzero(~_whole(group, written, paths)):
+            raise DatasetError(f"{url}: shard {paths[place]} was changed by somebody else. Run the same command again")
+        for path in list_leftovers(group, paths):
             delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None
         objects = manifest.objects if manifest else None
-        put_so_far(group, SoFar(rows))
-        commit(group, rows, {"statistics": statistics, "status": "complete"}, objects=objects)
+        put_so_far(group, SoFar(table))
+        commit(group, table, {"statistics": statistics, "status": "complete"}, objects=objects)
         with contextlib.suppress(StorageError):  # it is complete, and where nothing may be removed this is ignored
             delete_object(group, SO_FAR)
 

@@ -1,7 +1,6 @@
 """``dsffnet transfer``: pose a mesh, or a sequence of meshes, like another."""
 
 import argparse
-import gc
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -104,11 +103,8 @@ def transfer_command(options: argparse.Namespace) -> None:
         memory_errors("Nothing was written over; decimate the meshes (docs/transfer.md says what they take)"),
     ):
         print_note("loading the network ...")
-        gc.disable()  # what an import makes is no garbage, and looking for some is a tenth of torch's
-        try:
-            from workflows.transfer.run import TransferWork
-        finally:
-            gc.enable()
+        from workflows.transfer.run import TransferWork
+
         work = TransferWork.of(job, weights, first=source.mesh, target=target, force=options.force)
         print_text(printable(work.run()))
 

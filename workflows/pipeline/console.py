@@ -1,6 +1,7 @@
 """How the commands report: text, errors in one line with an exit status; and the MLflow server they mirror to."""
 
 import argparse
+import gc
 import io
 import logging
 import os
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 _SPINS = "20000"
 """Rounds that a waiting thread of torch's (libgomp) stays awake; its own choice is 300,000."""
+_GARBAGE = 10_000, 20, 50
+"""Of ``gc.set_threshold``: at its own, 700, 10 and 10, a tenth of a command's time goes into looking for garbage among
+what imports and bodies have made.
+"""
 _LESS = "lower counts, vertices, training.batch or widths"
 
 
@@ -35,6 +40,7 @@ def guarded(main: Callable[[], None]) -> None:
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop,
     129: the terminal was closed.
     """
+    gc.set_threshold(*_GARBAGE)
     _prepare_output()
     _let_others_work()
     told = _heed_signals()

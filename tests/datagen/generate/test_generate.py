@@ -22,7 +22,7 @@ from datagen.generate import ensure_shards, generate, inline, make_shard, shards
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
-from datagen.store.manifest import commit
+from datagen.store.manifest import commit, table_of
 from datagen.store.objects import read_bytes, write_bytes
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
@@ -113,7 +113,7 @@ def test_two_generators_on_a_store_without_a_lock(dataset: str, monkeypatch: pyt
         if not seen:
             group = open_group(url, mode="r+")
             root = read_bytes(group, "zarr.json") or b""
-            commit(group, [], {"status": "building"})
+            commit(group, table_of([]), {"status": "building"})
             if cut:  # the manifest is written before the root
                 write_bytes(group, "zarr.json", root)
             with pytest.raises(DatasetError) as caught:
