@@ -166,7 +166,7 @@ def memory(topology: str) -> None:
 
 
 def scaling(topology: str, identities: int) -> None:
-    """Whole shards a second on one and on two Ray workers: medians, as pages of untouched memory cost what they like."""
+    """Whole shards a second on one and on two Ray workers: medians, as new pages of files cost what they like."""
     recipe, rates = recipe_of(topology, identities), dict[int, list[float]]()
     for workers in (1, 2, 1, 2):
         rates.setdefault(workers, []).extend(_on_workers(recipe, workers))

@@ -50,11 +50,13 @@ _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's ow
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
+_SURELY = 2.0, 6.0  # times less by a few vertices, of a mesh that is understood twice as well as it must be, of others
+_SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
-_FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways, of which so many are read as well as the others
+_FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
 _SIDES = 6  # of a box: directions along the axes
-_QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
+_QUARTERS = np.radians([90.0, 180.0, 270.0])
 _TURNS = 3
 _TILTS = np.radians([16.0, 8.0, 4.0])  # about any axis, tried after the best of all ways is known
 _ANGLES = np.radians(np.arange(0.0, 360.0, 30.0))
@@ -74,12 +76,15 @@ class Standing:
         In degrees (`Parts.rest_error`); NaN where nobody asked.
     lean
         How the body is turned [3, 3] from upright after that, where it has to be known before the body is understood.
+    root
+        How the root is turned from rest [3, 3] then; None where nobody asked.
     """
 
     matrix: NDArray[np.float64]
     misfit: float
     rest_error: float = np.nan
     lean: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    root: NDArray[np.float64] | None = None
 
     def turned(self, vertices: Floats) -> Floats:
         """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z."""
@@ -111,8 +116,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways.
     """
     ways = _Ways(understand, _probe(mesh))
-    as_it_is, *others = ways.seen([_about_vertical(angle) for angle in _QUARTERS])
-    if as_it_is.misfit <= min(KNOWN, *(_CLEARLY * other.misfit for other in others)):
+    as_it_is = ways.seen([np.eye(3)])[0]
+    if as_it_is.misfit <= KNOWN and ways.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
@@ -130,14 +135,15 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return upright.leans
     if along_axes.misfit > _CLEARLY * best.misfit:
         found = min(found, upright, key=lambda way: way.misfit)
-    return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else Standing(np.eye(3), as_it_is.misfit)
+    return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else as_it_is.stands
 
 
-def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
+def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64] | Standing) -> NDArray[np.float64]:
     """Return the turn [3, 3] of a body with Y up from upright and facing +Z: ``before`` but for a clear change.
 
-    That is about the vertical (above 6 degrees), or about any axis where the body leans by more than 12 degrees, seen
-    from ``before``, and has a lesser misfit upright.
+    ``before`` is the turn [3, 3] of the last frame, or how this very body was found to stand. A change is clear about
+    the vertical (above 6 degrees), or about any axis where the body leans by more than 12 degrees, seen from
+    ``before``, and has a lesser misfit upright.
     """
     probe = _probe(vertices)
 
@@ -145,7 +151,11 @@ def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float
         misfits, roots = understand(_boxed(probe @ way)[None])
         return _Seen(way, float(misfits[0]), roots[0])
 
-    found = seen(before)
+    if isinstance(before, Standing):
+        known = None if before.root is None else _Seen(before.lean, before.misfit, before.root)
+        found = known or seen(before.lean)
+    else:
+        found = seen(before)
     for _ in range(_TURNS):
         if _leaning(found.root) <= _UPRIGHT or (upright := seen(found.way @ found.root)).misfit >= found.misfit:
             break
@@ -186,14 +196,14 @@ class _Seen(NamedTuple):
 
     @property
     def stands(self) -> Standing:
-        return Standing(self.way, self.misfit)
+        return Standing(self.way, self.misfit, root=self.root)
 
     @property
     def leans(self) -> Standing:
         """Of a way that brings a body upright: turned about the vertical alone, the rest being its lean."""
         facing = _facing(self.way.T)
         about = _about_vertical(-facing if abs(facing) > _STRAIGHT else 0.0)
-        return Standing(about, self.misfit, lean=about @ self.way.T)
+        return Standing(about, self.misfit, lean=about @ self.way.T, root=self.root)
 
 
 class _Ways:
@@ -206,6 +216,13 @@ class _Ways:
         misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T, vertices) for way in ways]))
         return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
 
+    def none_is_clearer(self, seen: _Seen, others: Sequence[NDArray[np.float64]]) -> bool:
+        """Whether none of the other ways is clearly better understood; a few vertices tell where that is plain."""
+        surely = _SURELY[seen.misfit > KNOWN / 2]
+        if all(surely * seen.misfit <= other.misfit for other in self.seen(others, _FIRST_VERTICES)):
+            return True
+        return all(seen.misfit <= _CLEARLY * other.misfit for other in self.seen(others))
+
     def best_of(self, ranked: Sequence[_Seen]) -> _Seen:
         """The way with the least misfit of those that a few vertices rank first."""
         likely = sorted(ranked, key=lambda way: way.misfit)[:_KEPT]
@@ -214,7 +231,9 @@ class _Ways:
     def turned(self, found: _Seen, undone: Callable[[_Seen], NDArray[np.float64]]) -> _Seen:
         """The way turned by what undoes the root's turn, as far as the network can say."""
         for _ in range(_TURNS):
-            found = self.seen([undone(found) @ found.way])[0]
+            if Rotation.from_matrix(turn := undone(found)).magnitude() < _SETTLED:
+                break
+            found = self.seen([turn @ found.way])[0]
         return found
 
     def faced(self, found: _Seen) -> _Seen:

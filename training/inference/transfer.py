@@ -151,7 +151,7 @@ class PoseTransfer:
         check_mesh(target, name="target")
         target_axes = target_axes or self.standing(target.vertices)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
-        frames = self._frames(sources, source_axes, upright, target_axes.lean)
+        frames = self._frames(sources, source_axes, upright, target_axes)
         if smooth:
             from training.inference.smoothing import smoothed
 
@@ -231,26 +231,28 @@ class PoseTransfer:
         assert self._parts is not None
         return rest_error(self._parts, mesh)
 
-    def _turned_round(self, vertices: Floats, before: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The turn [3, 3] of a body from upright, facing +Z, if the network can say; ``before``: the last frame's."""
-        return facing(understanding_of(self._network), vertices, before) if isinstance(self._network, Parts) else before
+    def _turned_round(self, vertices: Floats, before: NDArray[np.float64] | Axes | Standing) -> NDArray[np.float64]:
+        """The turn [3, 3] of a body from upright, facing +Z, if the network can say (`facing`)."""
+        if isinstance(self._network, Parts):
+            before = before.lean if isinstance(before, Axes) else before
+            return facing(understanding_of(self._network), vertices, before)
+        return before if isinstance(before, np.ndarray) else before.lean
 
     def _frames(
-        self, sources: Iterable[Mesh], axes: Stands, target: Mesh, lean: NDArray[np.float64]
+        self, sources: Iterable[Mesh], axes: Stands, target: Mesh, target_axes: Axes | Standing
     ) -> Iterator[Floats]:
         """Placed vertices [n_target, 3] of each frame, Y up; the target leans, but for what is found here."""
         trajectory: RootTrajectory | None = None
         turn = np.eye(3)
-        own = target.vertices @ self._turned_round(target.vertices, lean)  # how it leans is of its pose, and goes
+        own = target.vertices @ self._turned_round(target.vertices, target_axes)  # its lean is of its pose, and goes
         posed = self._poser(Mesh(own, target.faces))
         for number, source in enumerate(sources):
             mesh = check_mesh(source, name=f"source {number}")
             if number == 0:  # the others may turn round and bend
                 axes = axes or self.standing(mesh.vertices)
-                turn = axes.lean
             assert axes is not None
             vertices = axes.turned(mesh.vertices)
-            turn = self._turned_round(vertices, turn)
+            turn = self._turned_round(vertices, turn if number else axes)
             read = vertices @ turn
             output = posed(Mesh(read, mesh.faces)) @ turn.T
             scale = scale_of(target, output)

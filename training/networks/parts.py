@@ -14,8 +14,9 @@ No scale is taken from the source, so that missing vertices of it do not matter 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +36,10 @@ from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
+_SURELY_CORRECTED = 0.1
+"""Sum of squares over the rotations' numbers up to which a correction is always better (docs/networks.md): whether it
+is need not be read.
+"""
 
 
 class Reading(NamedTuple):
@@ -195,11 +200,10 @@ class Parts(nn.Module):
         logits, rest = self.part(features), self.rest(features)
         turns, joints = self._pose(drawn, features, logits, rest)
         if vertices is not None:
-            features = self._of_all(vertices, drawn, features, known)
-            logits, rest = self.part(features), self.rest(features)
+            logits, rest = self._of_all(vertices, drawn, features, known)
         return Reading(logits, rest, turns, joints)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
         """Return how badly meshes [b, n, 3] are understood, and how they are turned.
 
@@ -239,7 +243,7 @@ class Parts(nn.Module):
         """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return self.part(self._of_all(vertices, drawn, features, known)).softmax(2)
+        return self._of_all(vertices, drawn, features, known)[0].softmax(2)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -274,38 +278,43 @@ class Parts(nn.Module):
 
         output, found, missing = posed(turns)
         corrected = wanted @ found.mT @ turns
-        better, _, left = posed(corrected)
-        is_better = left <= missing
+        is_better = missing <= _SURELY_CORRECTED
+        if output.is_cuda or torch.compiler.is_compiling() or not bool(is_better.all()):
+            better, _, left = posed(corrected)
+            is_better = is_better | (left <= missing)
+        else:
+            better = self.posed(as_read, weights, joints, corrected)
         if as_read is vertices:
             return torch.where(is_better[:, None, None], better, output)
         return self.posed(vertices, weights, joints, torch.where(is_better[:, None, None, None], corrected, turns))
 
-    def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> Tensor:
-        """Features [b, n, width] of all vertices, those of the sample [b, k, width] being known."""
+    def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> tuple[Tensor, Tensor]:
+        """Logits and rest positions, as in a reading, of all vertices; features of the sample [b, k, c] are known."""
         rows, found = [drawn.rows], [features]
         for some, around in others(vertices, drawn):
             rows.append(some)
             found.append(self._passed(around, drawn, known.again()))
-        return taken(torch.cat(found, dim=1), torch.cat(rows, dim=1).argsort(dim=1))
+        order, every = torch.cat(rows, dim=1).argsort(dim=1), torch.cat(found, dim=1)
+        return taken(self.part(every), order), taken(self.rest(every), order)
 
     def _passed(self, around: Surroundings, drawn: Sample, known: _OfSample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
 
-        def normed(outputs: Tensor, shift: Tensor | float = 0) -> Tensor:
-            mean, scale = known(_statistics, outputs, drawn.masses)
-            return torch.relu((outputs - mean) * scale + shift)
+        def normed(layer: nn.Module, features: Tensor, shift: Tensor | None = None) -> Tensor:
+            assert isinstance(layer, nn.Linear)
+            return known.normed(layer, features, drawn.masses, shift)
 
         def mixed(features: Tensor, layer: nn.Module) -> Tensor:
             assert isinstance(layer, Around)
             heard = around.mean(known(layer.tells, features, drawn.masses))
-            return features + layer.change(normed(layer.mixed(torch.cat([features, heard], dim=2))))
+            return features + layer.change(normed(layer.mixed, torch.cat([features, heard], dim=2)))
 
         first, second = self.mix
-        features = normed(self.lift(torch.cat([around.vertices, around.offsets], dim=2)))
-        features = mixed(normed(self.features(features)), self.around[0])
+        features = normed(self.lift, torch.cat([around.vertices, around.offsets], dim=2))
+        features = mixed(normed(self.features, features), self.around[0])
         whole = known(self._whole, features, drawn.masses)
-        features = mixed(normed(first(features), whole), self.around[1])
-        features = mixed(normed(second(features)), self.around[2])
+        features = mixed(normed(first, features, whole), self.around[1])
+        features = mixed(normed(second, features), self.around[2])
         return mixed(features, self.around[3])
 
     def _whole(self, features: Tensor, masses: Tensor) -> Tensor:
@@ -351,21 +360,32 @@ class _OfSample:
 
     def __init__(self) -> None:
         self._known: list[Any] = []
-        self._next = 0
+        self._told: Iterator[Any] | None = None
 
-    def __call__(self, compute: Callable[..., _Known], *inputs: Tensor) -> _Known:
-        if self._next == len(self._known):
+    def __call__(self, compute: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
+        if self._told is None:
             self._known.append(compute(*inputs))
-        self._next += 1
-        known: _Known = self._known[self._next - 1]
+        known: Tensor = self._known[-1] if self._told is None else next(self._told)
         return known
 
+    def normed(self, layer: nn.Linear, features: Tensor, masses: Tensor, shift: Tensor | None) -> Tensor:
+        """A layer's outputs [b, n, c], normed as those of the sample are, shifted, and what is below zero cut off."""
+        if self._told is not None:  # one product: norm and shift are taken into its weights
+            bias, weight = next(self._told)()
+            return torch.baddbmm(bias, features, weight).relu_()
+        outputs: Tensor = layer(features)
+        mean, scale = _statistics(outputs, masses)
+
+        def shifted(values: Tensor) -> Tensor:
+            return values if shift is None else values + shift
+
+        at_zero = 0 if layer.bias is None else layer.bias
+        self._known.append(cache(lambda: (shifted((at_zero - mean) * scale), layer.weight.mT * scale)))
+        return shifted((outputs - mean) * scale).relu_()
+
     def again(self) -> _OfSample:
-        self._next = 0
+        self._told = iter(self._known)
         return self
-
-
-_Known = TypeVar("_Known")
 
 
 def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:

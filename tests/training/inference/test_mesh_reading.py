@@ -34,6 +34,17 @@ def test_a_mesh_is_read_filtered_where_it_is_understood_better_so_and_posed_as_i
     assert (rough - even).abs().mean() >= 0.3 * moved and (moved > 0) == better
 
 
+def test_a_mesh_that_the_filter_leaves_nearly_as_it_is_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, asked = lively("parts").eval(), list[int]()
+    monkeypatch.setattr(network, "understood", lambda meshes: (torch.ones(2), asked.append(len(meshes))))
+    for ball in (sphere(subdivisions=4), noisy(sphere(subdivisions=4), 0.003)):
+        read = read_targets(network, [ball])
+        assert torch.equal(read.as_read, read.vertices)
+    assert not asked
+    read_targets(network, [noisy(sphere(subdivisions=4), 0.02)])
+    assert asked == [2]
+
+
 def test_what_is_filtered_and_posed_does_not_depend_on_what_else_is_in_a_batch() -> None:
     network, meshes = lively("parts").eval(), [noisy(sphere(subdivisions=2), spread) for spread in (0.0, 0.05)]
     together = transferred(network, meshes, meshes[::-1])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from datagen.mesh.rig import part_transforms
 from tests.support.shapes.samples import offsets_of
 from tests.support.three_networks import lively, meshes
-from training.networks import build_network
+from training.networks import build_network, parts
 from training.networks.layers import sampling
 from training.networks.layers.rigid_parts import (
     ancestors,
@@ -99,6 +99,30 @@ def test_vertices_beyond_the_sample_hear_what_they_would_of_all_of_it(
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
     inside = taken(found.logits, drawn.rows)
     torch.testing.assert_close(inside, network.read(drawn).logits, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("surely", "reads"), [(0.0, 3), (1e9, 2)])
+@torch.no_grad()
+def test_a_correction_is_read_only_where_it_may_be_worse(
+    monkeypatch: pytest.MonkeyPatch, surely: float, reads: int
+) -> None:
+    network = lively("parts").eval()
+    assert isinstance(network, Parts)
+    monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
+    source, target = sample(meshes(300, seed=1)), network.read_target(meshes(200, seed=2))
+    wanted = network.read(source).rotations
+    turns, missing, outputs = [wanted @ target.rotations.mT], [], []
+    for _ in range(2):
+        outputs.append(network.posed(target.vertices, target.weights, target.joints, turns[-1]))
+        found = network.read(target.drawn.moved(taken(outputs[-1], target.drawn.rows))).rotations
+        missing.append((wanted - found).square().sum((1, 2, 3)))
+        turns.append(wanted @ found.mT @ turns[-1])
+    better = (missing[1] <= missing[0]) | (missing[0] <= surely)
+    asked, real = list[int](), network.read
+    monkeypatch.setattr(network, "read", lambda drawn: asked.append(1) or real(drawn))
+    posed = network._corrected(source, target)
+    torch.testing.assert_close(posed, torch.where(better[:, None, None], outputs[1], outputs[0]), rtol=0, atol=1e-6)
+    assert len(asked) == reads
 
 
 @torch.no_grad()
