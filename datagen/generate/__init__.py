@@ -136,8 +136,9 @@ def append(
         if grown != stored:
             before = open_dataset(url)  # an unfinished one must be finished first, and says how
             _make_missing(grown, url, run, progress, before=before)
-            return Dataset(url, open_group(url))  # of its shards the old were looked at then, the new were now
-        if not _complete(url, stored):
+            if is_local(url):  # nobody else wrote: of its shards the old were looked at then, the new were now
+                return Dataset(url, open_group(url))
+        elif not _complete(url, stored):
             _make_missing(stored, url, run, progress)
     return open_dataset(url)
 

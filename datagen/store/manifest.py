@@ -230,6 +230,8 @@ def read_so_far(group: zarr.Group) -> SoFar | None:
         raise ValueError(SO_FAR)
     table = np.frombuffer(content[32:], _SO_FAR_ROW)
     _require_places(table["place"])
+    if len(np.unique(table["place"], axis=0)) < len(table):
+        raise ValueError(SO_FAR)
     shards, sound = _table_of({name: table[name] for name in _DIMENSIONS}), table["sound"] > 0
     return SoFar(shards[sound], shards[~sound])
 

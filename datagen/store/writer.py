@@ -399,8 +399,9 @@ def finish(url: str, recipe: DatasetRecipe, table: ShardTable, *, written: Shard
         group = ShardWriter(url, recipe).group
         written = table if written is None else written
         paths = paths_of(written)
-        for place in np.flatnonzero(~_whole(group, written, paths)):
-            raise DatasetError(f"{url}: shard {paths[place]} was changed by somebody else. Run the same command again")
+        if len(changed := np.flatnonzero(~_whole(group, written, paths))):
+            path = paths[changed[0]]
+            raise DatasetError(f"{url}: shard {path} was changed by somebody else. Run the same command again")
         for path in list_leftovers(group, paths):
             delete_object(group, path)
         manifest = read_manifest(group) if is_sealed(group) else None

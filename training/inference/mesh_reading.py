@@ -1,13 +1,15 @@
 """What networks are given of meshes: vertices in their boxes, and what is near along surfaces, where they take that.
 
 A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
-the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh clearly better so, as one with noise. A transfer
+the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. An output is
+compared with such a source through the same filter, so that what the filter does to a body is no difference. A transfer
 reads its meshes so, and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise,
 do not; nor does what asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which
 parts an output is projected.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,12 +22,26 @@ from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.mesh.low_pass import LowPass
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
+from training.recipes.networks import PEOPLE
 
-_FILTERED = 2
-"""How often a mesh is low-passed before it is read."""
-_CLEARLY, _LOOKED_AT = 0.85, 256
-"""Of the misfit as the mesh is, and vertices by which it is told."""
-_STILL = 0.006
+
+class _Filter(NamedTuple):
+    """How often a mesh is low-passed, what part of its misfit has to be left where it is read so, and whether outputs
+    are read in the same way then.
+    """
+
+    times: int
+    left: float
+    of_outputs: bool
+
+
+_STRONG, _WEAK = _Filter(8, 0.9, of_outputs=True), _Filter(2, 0.85, of_outputs=False)
+"""Of people, and of animals and coarse meshes, whose thin limbs the former would smooth away (docs/networks.md)."""
+_COARSE = 500
+"""Vertices of a mesh, up to which the filter is weak."""
+_LOOKED_AT = 256
+"""Vertices by which the misfit is told."""
+_STILL = 0.008
 """Root of the mean square, half the longest edge of a mesh' box being 1, up to which a filter changes next to nothing:
 noise of 0.01 is moved by more.
 """
@@ -78,7 +94,7 @@ def stacked(network: nn.Module, meshes: Sequence[Floats]) -> Tensor:
 def transferred(network: nn.Module, sources: Sequence[Mesh], targets: Sequence[Mesh]) -> Tensor:
     """Return targets of n vertices each [b, n, 3] in the poses of sources of m vertices each, in boxes of their own."""
     if isinstance(network, Parts):
-        return posed_targets(network, sources, read_targets(network, targets))
+        return posed_targets(network, sources, targets, read_targets(network, targets))
     inputs = {name: stacked(network, [mesh.vertices for mesh in meshes])
               for name, meshes in (("source", sources), ("target", targets))}  # fmt: skip
     output: Tensor = network(**inputs, **surfaces_of(network, sources=sources, targets=targets))
@@ -89,7 +105,8 @@ def transferred(network: nn.Module, sources: Sequence[Mesh], targets: Sequence[M
 def read_targets(network: Parts, targets: Sequence[Mesh]) -> ReadTarget:
     """Return what a parts network reads off targets of as many vertices each."""
     boxes = [bounding_box(np.asarray(mesh.vertices, np.float64)) for mesh in targets]
-    read = [box.normalise(_as_read(network, mesh)).astype(np.float32) for box, mesh in zip(boxes, targets, strict=True)]
+    vertices = [_as_read(network, mesh)[0] for mesh in targets]
+    read = [box.normalise(each).astype(np.float32) for box, each in zip(boxes, vertices, strict=True)]
     device = device_of(network)
     return network.read_target(
         stacked(network, [mesh.vertices for mesh in targets]),
@@ -100,30 +117,40 @@ def read_targets(network: Parts, targets: Sequence[Mesh]) -> ReadTarget:
 
 @torch.inference_mode()
 def posed_targets(
-    network: Parts, sources: Sequence[Mesh], targets: ReadTarget, surface: Surface | None = None
+    network: Parts, sources: Sequence[Mesh], targets: Sequence[Mesh], read: ReadTarget, surface: Surface | None = None
 ) -> Tensor:
-    """Return targets [b, n, 3] that were read, in the poses of as many sources, in boxes of their own.
+    """Return targets [b, n, 3] that were ``read``, in the poses of as many sources, in boxes of their own.
 
     ``surface``: of the sources, where it is known.
     """
     surface = surface or surface_of_meshes(sources).to(device_of(network))
-    read = stacked(network, [_as_read(network, mesh) for mesh in sources])
-    return network.posed_target(read, targets, surface)
+    vertices, filters = zip(*(_as_read(network, mesh) for mesh in sources), strict=True)
+    times = [each.times if each and each.of_outputs else 0 for each in filters]
+
+    def heard(outputs: Tensor) -> Tensor:
+        """Outputs [b, n, 3] as they are read, each as its source was."""
+        filtered = [LowPass(mesh.faces, len(mesh.vertices))(output.double().cpu().numpy(), often)
+                    for mesh, output, often in zip(targets, outputs, times, strict=True)]  # fmt: skip
+        return torch.from_numpy(np.stack(filtered)).to(outputs)
+
+    return network.posed_target(stacked(network, vertices), read, surface, heard=heard if any(times) else None)
 
 
-def _as_read(network: Parts, mesh: Mesh) -> Floats:
-    """The vertices [n, 3] of a mesh as they are, or where the low-pass filter leaves them."""
+def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, _Filter | None]:
+    """The vertices [n, 3] of a mesh as they are, or where a low-pass filter leaves them; and which."""
     vertices = np.asarray(mesh.vertices, np.float64)
     if not len(mesh.faces):
-        return vertices
-    filtered = LowPass(mesh.faces, len(vertices))(vertices, _FILTERED)
-    moved = np.sqrt(3 * np.square(filtered - vertices).mean()) / bounding_box(vertices).half
-    if moved <= _STILL:
-        return vertices
+        return vertices, None
+    chosen = _STRONG if network.joints == tuple(PEOPLE) and len(vertices) > _COARSE else _WEAK
+    filtered = LowPass(mesh.faces, len(vertices))(vertices, chosen.times)
+    moved = np.square(filtered - vertices).sum(axis=1)
+    moved = moved[moved > 0]  # points and open borders stay
+    if not len(moved) or np.sqrt(moved.mean()) <= _STILL * bounding_box(vertices).half:
+        return vertices, None
     some = np.random.default_rng(0).permutation(len(vertices))[:_LOOKED_AT]
     looked_at = stacked(network, [vertices, filtered])[:, some]
     misfits = network.understood(looked_at)[0]
-    return filtered if bool(misfits[1] < _CLEARLY * misfits[0]) else vertices
+    return (filtered, chosen) if bool(misfits[1] < chosen.left * misfits[0]) else (vertices, None)
 
 
 def _in_faces(mesh: Mesh) -> NDArray[np.bool_]:

@@ -113,7 +113,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     Parameters
     ----------
     mesh
-        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways.
+        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways, and to rule out the other quarter turns
+        of a mesh that is understood as it is.
     """
     ways = _Ways(understand, _probe(mesh))
     as_it_is = ways.seen([np.eye(3)])[0]
@@ -121,7 +122,7 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
-    if understood and (ahead := ways.faced(best)) is not best:
+    if understood and (ahead := ways.ahead(best)).misfit <= KNOWN:
         return ahead.stands
     every = ways.seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES], _FIRST_VERTICES)
     along_axes, best = (ways.best_of(some) for some in (every[: _SIDES * len(_ANGLES)], every))
@@ -231,14 +232,19 @@ class _Ways:
     def turned(self, found: _Seen, undone: Callable[[_Seen], NDArray[np.float64]]) -> _Seen:
         """The way turned by what undoes the root's turn, as far as the network can say."""
         for _ in range(_TURNS):
-            if Rotation.from_matrix(turn := undone(found)).magnitude() < _SETTLED:
+            turn = undone(found)
+            if np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) < _SETTLED:
                 break
             found = self.seen([turn @ found.way])[0]
         return found
 
+    def ahead(self, found: _Seen) -> _Seen:
+        """The way turned about the vertical until the body faces +Z."""
+        return self.turned(found, lambda found: _about_vertical(-found.facing))
+
     def faced(self, found: _Seen) -> _Seen:
         """The way turned about the vertical until the body faces +Z; left where that is misread, as where it leans."""
-        ahead = self.turned(found, lambda found: _about_vertical(-found.facing))
+        ahead = self.ahead(found)
         return ahead if ahead.misfit <= max(KNOWN, found.misfit) else found
 
 

@@ -9,7 +9,7 @@ paper's normalisation suggests, would let it float at the height of its hips.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -149,9 +149,9 @@ class PoseTransfer:
             While iterating: a mesh cannot be used.
         """
         check_mesh(target, name="target")
-        target_axes = target_axes or self.standing(target.vertices)
+        target_axes = _as_told(target_axes) or self.standing(target.vertices)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
-        frames = self._frames(sources, source_axes, upright, target_axes)
+        frames = self._frames(sources, _as_told(source_axes), upright, target_axes)
         if smooth:
             from training.inference.smoothing import smoothed
 
@@ -199,7 +199,7 @@ class PoseTransfer:
             if first is None or not _is_same_mesh(source, first):
                 first, surface = source, surface_of_meshes([source]).to(self._device)
             with products("float32"):
-                return posed_targets(network, [source], read, surface)[0].double().cpu().numpy()
+                return posed_targets(network, [source], [target], read, surface)[0].double().cpu().numpy()
 
         return posed
 
@@ -258,6 +258,11 @@ class PoseTransfer:
             scale = scale_of(target, output)
             trajectory = trajectory or RootTrajectory(standing_point(vertices), scale / float(bounding_box(read).half))
             yield placed(target, scale * output) + trajectory.offset(vertices)
+
+
+def _as_told(axes: Stands) -> Stands:
+    """How a mesh stands without what was read of a root, which may have been another mesh's."""
+    return replace(axes, root=None) if isinstance(axes, Standing) else axes
 
 
 def _is_same_mesh(one: Mesh, other: Mesh) -> bool:

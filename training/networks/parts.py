@@ -15,7 +15,6 @@ No scale is taken from the source, so that missing vertices of it do not matter 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -37,8 +36,8 @@ from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
 _SURELY_CORRECTED = 0.1
-"""Sum of squares over the rotations' numbers up to which a correction is always better (docs/networks.md): whether it
-is need not be read.
+"""Sum of squares over the rotations' numbers up to which a correction is taken unread, as it was better each time that
+it was read (docs/networks.md).
 """
 
 
@@ -152,7 +151,7 @@ class Parts(nn.Module):
         """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
 
         Outside of training mode the output is read in its turn: errors in reading that source and output share, being
-        in one pose, cancel in the correction. One that is no better is not taken.
+        in one pose, cancel in the correction. A large one is read once more, and not taken where it is no better.
 
         Parameters
         ----------
@@ -187,11 +186,21 @@ class Parts(nn.Module):
             logits, _, rotations, joints = self.read(drawn, read)
             return ReadTarget(target, read, drawn, logits.softmax(2), rotations, joints)
 
-    def posed_target(self, source: Tensor, target: ReadTarget, surface: Surface | None = None) -> Tensor:
-        """Return what calling the network outside of training does, of targets that were read before."""
+    def posed_target(
+        self,
+        source: Tensor,
+        target: ReadTarget,
+        surface: Surface | None = None,
+        *,
+        heard: Callable[[Tensor], Tensor] | None = None,
+    ) -> Tensor:
+        """Return what calling the network outside of training does, of targets that were read before.
+
+        ``heard`` gives of outputs [b, n, 3] what is to be read of them, where sources were not read as they are.
+        """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
-            return self._corrected(sample(source, surface), target)
+            return self._corrected(sample(source, surface), target, heard)
 
     def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
         """Return what is read off a sample's vertices, or off all [b, n, 3] of the meshes that it was drawn from."""
@@ -266,14 +275,15 @@ class Parts(nn.Module):
         moved = moved_joints(joints, turns, self.parents, self.above)
         return boxed(skinned(vertices, weights, turns, joints, moved))
 
-    def _corrected(self, source: Sample, target: ReadTarget) -> Tensor:
+    def _corrected(self, source: Sample, target: ReadTarget, heard: Callable[[Tensor], Tensor] | None = None) -> Tensor:
         wanted = self.read(source).rotations
         vertices, as_read, drawn, weights, own, joints = target
         turns = wanted @ own.mT
 
         def posed(turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             output = self.posed(as_read, weights, joints, turns)
-            found = self.read(drawn.moved(taken(output, drawn.rows))).rotations
+            heard_of = output if heard is None else boxed(heard(output))
+            found = self.read(drawn.moved(taken(heard_of, drawn.rows))).rotations
             return output, found, (wanted - found).square().sum((1, 2, 3))
 
         output, found, missing = posed(turns)
@@ -371,7 +381,7 @@ class _OfSample:
     def normed(self, layer: nn.Linear, features: Tensor, masses: Tensor, shift: Tensor | None) -> Tensor:
         """A layer's outputs [b, n, c], normed as those of the sample are, shifted, and what is below zero cut off."""
         if self._told is not None:  # one product: norm and shift are taken into its weights
-            bias, weight = next(self._told)()
+            bias, weight = next(self._told)
             return torch.baddbmm(bias, features, weight).relu_()
         outputs: Tensor = layer(features)
         mean, scale = _statistics(outputs, masses)
@@ -380,10 +390,12 @@ class _OfSample:
             return values if shift is None else values + shift
 
         at_zero = 0 if layer.bias is None else layer.bias
-        self._known.append(cache(lambda: (shifted((at_zero - mean) * scale), layer.weight.mT * scale)))
+        self._known.append(lambda: (shifted((at_zero - mean) * scale), layer.weight.mT * scale))
         return shifted((outputs - mean) * scale).relu_()
 
     def again(self) -> _OfSample:
+        if self._told is None:
+            self._known = [known() if callable(known) else known for known in self._known]
         self._told = iter(self._known)
         return self
 

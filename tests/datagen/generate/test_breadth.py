@@ -16,7 +16,7 @@ from datagen.common.errors import DatasetError, StorageError
 from datagen.generate import append, ensure_shards, generate, identities, inline, plan, shards
 from datagen.generate.identities import describe_identities, joined
 from datagen.recipe import DatasetRecipe
-from datagen.store import open_dataset, writer
+from datagen.store import open_dataset, reader, writer
 from datagen.store.manifest import SoFar
 from datagen.store.verify import find_faults
 from tests.support.files import flip_bit, tree_hash
@@ -227,6 +227,10 @@ def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, mon
     real, sizes, leftovers = identities.identity_parameters, writer.stored_sizes, writer.list_leftovers
     there = {row.path for row in open_dataset(str(spoilable)).manifest}
     monkeypatch.setattr(writer, "stored_sizes", lambda group, paths: asked.extend(paths) or sizes(group, paths))
+    looked, read_sizes = list[int](), reader.stored_sizes
+    monkeypatch.setattr(
+        reader, "stored_sizes", lambda group, paths: looked.append(len(paths)) or read_sizes(group, paths)
+    )
     monkeypatch.setattr(writer, "list_leftovers", lambda group, paths: asked.extend(paths) or leftovers(group, paths))
     monkeypatch.setattr(identities, "identity_parameters", lambda *given: described.append(given[2]) or real(*given))
     append(str(spoilable), training=4, unseen=6, run=run)
@@ -237,6 +241,7 @@ def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, mon
     assert run.of("draw_rotations") == [[range(10, 12)]]
     new = {row.path for row in open_dataset(str(spoilable)).manifest} - there
     assert new and set(asked) == new
+    assert looked[0] == len(there) and len(looked) == 2, "as it is opened to grow, and here to see what is new"
 
 
 def test_a_new_shard_that_is_gone_before_the_end_is_not_committed(spoilable: Path) -> None:

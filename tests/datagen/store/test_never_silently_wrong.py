@@ -1,5 +1,6 @@
 """Accidents that left, or could leave, a dataset that looks sound and is not."""
 
+import hashlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -224,8 +225,8 @@ def test_committed_bytes_outlive_a_manifest_that_is_cut_short(
         assert not (url / shard).exists() and tree_hash(append(str(url), training=4).url) == whole
 
 
-@pytest.mark.parametrize("damaged", [False, True])
-def test_what_verify_found_stays_doubted_after_a_repair_that_is_cut_short(spoilable: Path, damaged: bool) -> None:
+@pytest.mark.parametrize("damaged", ["", "empty", "twice"])
+def test_what_verify_found_stays_doubted_after_a_repair_that_is_cut_short(spoilable: Path, damaged: str) -> None:
     def stopped(task: Any, arguments: list[Any]) -> Iterator[Any]:
         if task is ensure_shards:
             raise StorageError("no room")
@@ -239,8 +240,12 @@ def test_what_verify_found_stays_doubted_after_a_repair_that_is_cut_short(spoila
     recipe = DatasetRecipe.model_validate(grown)
     with pytest.raises(StorageError):
         repair(str(spoilable), recipe, list(find_faults(str(spoilable))), run=stopped)
-    if damaged:
-        (spoilable / "manifest/so_far").write_bytes(b"")
+    note = spoilable / "manifest/so_far"
+    if damaged == "empty":
+        note.write_bytes(b"")
+    elif damaged:  # all shards are listed twice
+        content = 2 * note.read_bytes()[32:]
+        note.write_bytes(hashlib.sha256(content).digest() + content)
     assert tree_hash(append(str(spoilable), training=4).url) == whole
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from datagen.mesh.geometry import Mesh
+from datagen.mesh.low_pass import LowPass
 from tests.support.shapes.avatars import noisy, sphere
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import (
@@ -14,6 +15,8 @@ from training.inference.mesh_reading import (
     surface_of_meshes,
     transferred,
 )
+from training.networks import parts
+from training.recipes.networks import PEOPLE
 
 NO_FACES = np.zeros((0, 3), np.int64)
 
@@ -28,10 +31,34 @@ def test_a_mesh_is_read_filtered_where_it_is_understood_better_so_and_posed_as_i
     read = read_targets(network, [ball])
     assert torch.equal(read.vertices, stacked(network, [ball.vertices]))
     assert torch.equal(read.as_read, read.vertices) != better
-    rough = posed_targets(network, [ball], read)[0]
-    even = posed_targets(network, [ball], read._replace(vertices=read.as_read))[0]
+    rough = posed_targets(network, [ball], [ball], read)[0]
+    even = posed_targets(network, [ball], [ball], read._replace(vertices=read.as_read))[0]
     moved = (read.vertices - read.as_read).abs().mean()
     assert (rough - even).abs().mean() >= 0.3 * moved and (moved > 0) == better
+
+
+@pytest.mark.parametrize(("people", "subdivisions"), [(True, 3), (True, 2), (False, 3)])
+def test_what_a_person_is_read_through_the_output_is_read_through(
+    people: bool, subdivisions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight times of 642 vertices; twice, and the source alone, of 162, and of animals."""
+    network = lively("parts", **({"joints": PEOPLE} if people else {})).eval()
+    source, target = noisy(sphere(subdivisions=subdivisions), 0.03), sphere(subdivisions=2)
+    monkeypatch.setattr(parts, "_SURELY_CORRECTED", 1e9)
+    monkeypatch.setattr(network, "understood", lambda meshes: (torch.tensor([1.0, 0.5]), None))
+    read, (surface,) = network.read_target(stacked(network, [target.vertices])), [surface_of_meshes([source])]
+    strong = people and subdivisions == 3
+    filtered = stacked(network, [LowPass(source.faces, len(source.vertices))(source.vertices, 8 if strong else 2)])
+
+    def heard(outputs: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(LowPass(target.faces, len(target.vertices))(outputs[0].numpy(), 8))[None].float()
+
+    with torch.no_grad():
+        expected = network.posed_target(filtered, read, surface, heard=heard if strong else None)
+        otherwise = network.posed_target(filtered, read, surface, heard=None if strong else heard)
+    posed = posed_targets(network, [source], [target], read)
+    torch.testing.assert_close(posed, expected, rtol=0, atol=1e-5)
+    assert (posed - otherwise).abs().max() > 1e-3
 
 
 def test_a_mesh_that_the_filter_leaves_nearly_as_it_is_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,8 +68,12 @@ def test_a_mesh_that_the_filter_leaves_nearly_as_it_is_is_not_looked_at(monkeypa
         read = read_targets(network, [ball])
         assert torch.equal(read.as_read, read.vertices)
     assert not asked
-    read_targets(network, [noisy(sphere(subdivisions=4), 0.02)])
+    rough = noisy(sphere(subdivisions=4), 0.02)
+    read_targets(network, [rough])
     assert asked == [2]
+    loose = np.tile(rough.vertices, (11, 1))  # ten of eleven vertices have no face, and stay
+    read_targets(network, [Mesh(loose, rough.faces)])
+    assert asked == [2, 2]
 
 
 def test_what_is_filtered_and_posed_does_not_depend_on_what_else_is_in_a_batch() -> None:

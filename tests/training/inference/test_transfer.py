@@ -2,14 +2,18 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.support.shapes.avatars import sphere
+from tests.support.three_networks import lively
 from training.data.batch import Batch
 from training.inference import transfer
 from training.inference.predict import predict
+from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
 from training.networks import build_network
 from training.networks import execution as acceleration
@@ -27,6 +31,22 @@ def meshes_of(batch: int, seed: int = 1) -> dict[str, Tensor]:
     random = torch.Generator().manual_seed(seed)
     return {name: torch.rand(batch, count, 3, generator=random) * 2 - 1
             for name, count in (("source", 90), ("target", 70))}  # fmt: skip
+
+
+def test_a_way_to_stand_that_is_told_may_be_of_another_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its root is not believed then, that of a mesh that was looked at here is."""
+    body, known, real = sphere(subdivisions=2), list[bool](), transfer.facing
+
+    def watched(understand: Any, vertices: Any, before: Any) -> Any:
+        known.append(isinstance(before, Standing) and before.root is not None)
+        return real(understand, vertices, before)
+
+    monkeypatch.setattr(transfer, "facing", watched)
+    posing = PoseTransfer(lively("parts"))
+    found = posing.standing(body.vertices)
+    posing(source=body, target=body)
+    posing(source=body, target=body, source_axes=found, target_axes=found)
+    assert known == [True, True, False, False]
 
 
 @torch.no_grad()

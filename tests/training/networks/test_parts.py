@@ -126,6 +126,38 @@ def test_a_correction_is_read_only_where_it_may_be_worse(
 
 
 @torch.no_grad()
+def test_what_is_surely_corrected_is_so_in_any_company(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = lively("parts").eval()
+    assert isinstance(network, Parts)
+    source, target = (torch.cat([meshes(count, seed=seed) for seed in range(8)]) for count in (300, 200))
+    alone, reads = list[torch.Tensor](), network.read_target(target)
+    for surely in (0.0, 1e9):
+        monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
+        each = zip(source.split(1), target.split(1), strict=True)
+        alone.append(torch.cat([network._corrected(sample(one), network.read_target(other)) for one, other in each]))
+    judged, taken_unread = alone
+    refused = (judged - taken_unread).abs().amax((1, 2)) > 1e-5
+    assert refused.any() and not refused.all(), "else this shows nothing"
+    wanted = network.read(sample(source)).rotations
+    output = network.posed(target, reads.weights, reads.joints, wanted @ reads.rotations.mT)
+    found = network.read(reads.drawn.moved(taken(output, reads.drawn.rows))).rotations
+    missing = (wanted - found).square().sum((1, 2, 3))
+    surely = float(missing[refused].min())  # the first that is refused where it is read is taken unread
+    monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
+    together = network._corrected(sample(source), reads)
+    expected = torch.where((missing <= surely)[:, None, None], taken_unread, judged)
+    torch.testing.assert_close(together, expected, rtol=0, atol=1e-5)
+
+
+def test_a_graph_of_it_has_no_breaks() -> None:
+    network = lively("parts", blocks=1).train()
+    whole = torch.compile(network, fullgraph=True, backend="eager")
+    for count in (300, 1500):
+        given = {"source": meshes(count, seed=1), "target": meshes(count, seed=2)}
+        torch.testing.assert_close(whole(**given), network(**given), rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
 def test_meshes_of_a_batch_do_not_mix_where_they_are_more_than_their_samples() -> None:
     network = lively("parts").double().eval()
     large = torch.cat([sphere(2500, upper=0.8), 2.3 * sphere(2500, upper=0.3, seed=1)]).double()

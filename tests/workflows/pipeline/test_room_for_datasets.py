@@ -1,5 +1,6 @@
 """Commands say what a dataset takes before they make it, and refuse in one line what there is no room for."""
 
+import gc
 import io
 import os
 import sys
@@ -206,6 +207,15 @@ def test_a_name_that_is_no_text_at_all_is_one_line(capsys: Printed) -> None:
         "caf\udce9".encode()
 
     refused(lambda: guarded(no_text), 1, r"'caf\udce9' is not UTF-8 text", capsys)
+
+
+def test_a_command_looks_for_garbage_less_often() -> None:
+    before = gc.get_threshold()
+    try:
+        guarded(lambda: None)
+        assert gc.get_threshold() == (10_000, 20, 50)
+    finally:
+        gc.set_threshold(*before)
 
 
 def test_waiting_threads_fall_asleep_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
