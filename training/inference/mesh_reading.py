@@ -1,11 +1,11 @@
 """What networks are given of meshes: vertices in their boxes, and what is near along surfaces, where they take that.
 
 A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
-the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. An output is
-compared with such a source through the same filter, so that what the filter does to a body is no difference. A transfer
-reads its meshes so, and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise,
-do not; nor does what asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which
-parts an output is projected.
+the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. Outputs of people
+that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
+a body is no difference. A transfer reads its meshes so, and what measures transfers of single meshes. Evaluations on
+datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body, in which pose
+an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence
@@ -36,14 +36,16 @@ class _Filter(NamedTuple):
 
 
 _STRONG, _WEAK = _Filter(8, 0.9, of_outputs=True), _Filter(2, 0.85, of_outputs=False)
-"""Of people, and of animals and coarse meshes, whose thin limbs the former would smooth away (docs/networks.md)."""
-_COARSE = 500
-"""Vertices of a mesh, up to which the filter is weak."""
+"""Of people, and of animals and coarse meshes, of which the former takes too much (docs/networks.md)."""
+_COARSE, _ALIKE = 500, 1.5
+"""Vertices of a mesh, up to which its filter is weak; how many times as many as the source a target may have, or the
+source as the target, where outputs are filtered, too.
+"""
 _LOOKED_AT = 256
 """Vertices by which the misfit is told."""
 _STILL = 0.008
-"""Root of the mean square, half the longest edge of a mesh' box being 1, up to which a filter changes next to nothing:
-noise of 0.01 is moved by more.
+"""Root of the mean square over the vertices that are moved, half the longest edge of a mesh' box being 1, up to which a
+filter changes next to nothing: noise of 0.01 is moved by more.
 """
 _NEIGHBOURS = 8
 """Of points, that are taken to be near them along the surface."""
@@ -125,15 +127,23 @@ def posed_targets(
     """
     surface = surface or surface_of_meshes(sources).to(device_of(network))
     vertices, filters = zip(*(_as_read(network, mesh) for mesh in sources), strict=True)
-    times = [each.times if each and each.of_outputs else 0 for each in filters]
+    through = [LowPass(target.faces, len(target.vertices)) if _is_heard(chosen, source, target) else None
+               for chosen, source, target in zip(filters, sources, targets, strict=True)]  # fmt: skip
 
     def heard(outputs: Tensor) -> Tensor:
         """Outputs [b, n, 3] as they are read, each as its source was."""
-        filtered = [LowPass(mesh.faces, len(mesh.vertices))(output.double().cpu().numpy(), often)
-                    for mesh, output, often in zip(targets, outputs, times, strict=True)]  # fmt: skip
-        return torch.from_numpy(np.stack(filtered)).to(outputs)
+        rows = [output if low_pass is None
+                else torch.from_numpy(normalised(low_pass(output.double().cpu().numpy(), _STRONG.times))).to(output)
+                for low_pass, output in zip(through, outputs, strict=True)]  # fmt: skip
+        return torch.stack(rows)
 
-    return network.posed_target(stacked(network, vertices), read, surface, heard=heard if any(times) else None)
+    return network.posed_target(stacked(network, vertices), read, surface, heard=heard if any(through) else None)
+
+
+def _is_heard(chosen: _Filter | None, source: Mesh, target: Mesh) -> bool:
+    """Whether outputs are read through a source's filter, which does the same to both if they are as finely meshed."""
+    few, many = sorted((len(source.vertices), len(target.vertices)))
+    return chosen is not None and chosen.of_outputs and many <= _ALIKE * few
 
 
 def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, _Filter | None]:

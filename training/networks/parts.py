@@ -196,7 +196,7 @@ class Parts(nn.Module):
     ) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before.
 
-        ``heard`` gives of outputs [b, n, 3] what is to be read of them, where sources were not read as they are.
+        ``heard`` gives of outputs [b, n, 3] what is to be read of them, in boxes of their own; by default as they are.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
@@ -282,7 +282,7 @@ class Parts(nn.Module):
 
         def posed(turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             output = self.posed(as_read, weights, joints, turns)
-            heard_of = output if heard is None else boxed(heard(output))
+            heard_of = output if heard is None else heard(output)
             found = self.read(drawn.moved(taken(heard_of, drawn.rows))).rotations
             return output, found, (wanted - found).square().sum((1, 2, 3))
 

@@ -244,6 +244,14 @@ def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, mon
     assert looked[0] == len(there) and len(looked) == 2, "as it is opened to grow, and here to see what is new"
 
 
+def test_a_grown_dataset_on_a_store_without_a_lock_is_looked_at_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    url, looked, sizes = f"memory://{uuid4().hex}.zarr", list[int](), reader.stored_sizes
+    generate(tiny_dataset(), url)
+    monkeypatch.setattr(reader, "stored_sizes", lambda group, paths: looked.append(len(paths)) or sizes(group, paths))
+    grown = append(url, training=4)
+    assert len(looked) == 2 and looked[1] == len(grown.manifest) > looked[0]
+
+
 def test_a_new_shard_that_is_gone_before_the_end_is_not_committed(spoilable: Path) -> None:
     def losing(task: Any, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         yield from inline(task, arguments)

@@ -243,8 +243,11 @@ def test_what_verify_found_stays_doubted_after_a_repair_that_is_cut_short(spoila
     note = spoilable / "manifest/so_far"
     if damaged == "empty":
         note.write_bytes(b"")
-    elif damaged:  # all shards are listed twice
-        content = 2 * note.read_bytes()[32:]
+    elif damaged:  # a shard is listed twice, as two
+        content = note.read_bytes()[32:]
+        row = bytearray(content[: manifest._SO_FAR_ROW.itemsize])
+        row[manifest._SO_FAR_ROW.fields["blake3"][1]] ^= 1
+        content += bytes(row)
         note.write_bytes(hashlib.sha256(content).digest() + content)
     assert tree_hash(append(str(spoilable), training=4).url) == whole
 
