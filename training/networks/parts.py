@@ -304,8 +304,8 @@ class Parts(nn.Module):
         for some, around in others(vertices, drawn):
             rows.append(some)
             found.append(self._passed(around, drawn, known.again()))
-        order, every = torch.cat(rows, dim=1).argsort(dim=1), torch.cat(found, dim=1)
-        return taken(self.part(every), order), taken(self.rest(every), order)
+        every = taken(torch.cat(found, dim=1), torch.cat(rows, dim=1).argsort(dim=1))
+        return self.part(every), self.rest(every)
 
     def _passed(self, around: Surroundings, drawn: Sample, known: _OfSample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
