@@ -219,7 +219,7 @@ def _make_missing(
 
 
 def _divided(arrays: GridArrays, known: SoFar) -> tuple[SoFar, list[Wanted]]:
-    """What is known of an array's shards, those that are no others sound; and the shards that are to be made."""
+    """Divide these arrays' shards: what was written before, of which no other is sound; and what is to be made."""
     written, (places, rows) = known.written, arrays.places()
     numbers = {tuple(place): number for number, place in enumerate(written["place"].tolist())}
     number = np.array([numbers.get(tuple(place), -1) for place in places.tolist()], int)

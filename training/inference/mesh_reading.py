@@ -26,20 +26,17 @@ from training.recipes.networks import PEOPLE
 
 
 class _Filter(NamedTuple):
-    """How often a mesh is low-passed, what part of its misfit has to be left where it is read so, and whether outputs
-    are read in the same way then.
-    """
+    """How often a mesh is low-passed, and less than what part of its misfit has to be left where it is read so."""
 
     times: int
     left: float
-    of_outputs: bool
 
 
-_STRONG, _WEAK = _Filter(8, 0.9, of_outputs=True), _Filter(2, 0.85, of_outputs=False)
+_STRONG, _WEAK = _Filter(8, 0.9), _Filter(2, 0.85)
 """Of people, and of animals and coarse meshes, of which the former takes too much (docs/networks.md)."""
 _COARSE, _ALIKE = 500, 1.5
 """Vertices of a mesh, up to which its filter is weak; how many times as many as the source a target may have, or the
-source as the target, where outputs are filtered, too.
+source as the target, where outputs are read through the strong filter, too.
 """
 _LOOKED_AT = 256
 """Vertices by which the misfit is told."""
@@ -143,7 +140,7 @@ def posed_targets(
 def _is_heard(chosen: _Filter | None, source: Mesh, target: Mesh) -> bool:
     """Whether outputs are read through a source's filter, which does the same to both if they are as finely meshed."""
     few, many = sorted((len(source.vertices), len(target.vertices)))
-    return chosen is not None and chosen.of_outputs and many <= _ALIKE * few
+    return chosen is _STRONG and many <= _ALIKE * few
 
 
 def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, _Filter | None]:

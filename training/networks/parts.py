@@ -209,7 +209,8 @@ class Parts(nn.Module):
         logits, rest = self.part(features), self.rest(features)
         turns, joints = self._pose(drawn, features, logits, rest)
         if vertices is not None:
-            logits, rest = self._of_all(vertices, drawn, features, known)
+            features = self._of_all(vertices, drawn, features, known)
+            logits, rest = self.part(features), self.rest(features)
         return Reading(logits, rest, turns, joints)
 
     @torch.inference_mode()
@@ -252,7 +253,7 @@ class Parts(nn.Module):
         """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return self._of_all(vertices, drawn, features, known)[0].softmax(2)
+        return self.part(self._of_all(vertices, drawn, features, known)).softmax(2)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -298,14 +299,13 @@ class Parts(nn.Module):
             return torch.where(is_better[:, None, None], better, output)
         return self.posed(vertices, weights, joints, torch.where(is_better[:, None, None, None], corrected, turns))
 
-    def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> tuple[Tensor, Tensor]:
-        """Logits and rest positions, as in a reading, of all vertices; features of the sample [b, k, c] are known."""
+    def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> Tensor:
+        """Features [b, n, width] of all vertices, those of the sample [b, k, width] being known."""
         rows, found = [drawn.rows], [features]
         for some, around in others(vertices, drawn):
             rows.append(some)
             found.append(self._passed(around, drawn, known.again()))
-        every = taken(torch.cat(found, dim=1), torch.cat(rows, dim=1).argsort(dim=1))
-        return self.part(every), self.rest(every)
+        return taken(torch.cat(found, dim=1), torch.cat(rows, dim=1).argsort(dim=1))
 
     def _passed(self, around: Surroundings, drawn: Sample, known: _OfSample) -> Tensor:
         """Features [b, n, width] of vertices; norms, maximum and what is around are of the sample."""
