@@ -157,25 +157,23 @@ class RigTable:
         """
         own = [self._row[int(identity)] for identity in identities]
         rows = torch.arange(vertices.shape[1]).expand(len(own), -1) if rows is None else rows
-
-        def told(values: Sequence[Tensor]) -> Tensor:
-            """Of each mesh the values [n, c] where its vertices lie, by those at all of its topology [v, c]."""
-            each = zip(values, rows, strict=True)
-            if points is None:
-                return torch.stack([there[kept] for there, kept in each])
-            return torch.stack([points.at(mesh, kept).of(there)[0] for mesh, (there, kept) in enumerate(each)])
-
-        all_weights, all_rest = [self._weights[self._kinds[row]] for row in own], [self._rest[row] for row in own]
-        weights, rest = told(all_weights), told(all_rest)
         turns = self._world.index_select(0, sent(torch.from_numpy(np.asarray(poses, np.int64)), self._device))
         numbers = sent(torch.tensor(own), self._device)
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
-        if points is None:
-            posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
-        else:  # those of the posed triangles, not of the body at rest
-            bodies = zip(all_rest, all_weights, turns, joints, moved, strict=True)
-            posed = told([rigid_parts.skinned(*(each[None] for each in body))[0] for body in bodies])
+
+        def at(mesh: int, kept: Tensor) -> tuple[Tensor, ...]:
+            """Weights, rest positions and posed positions of vertices of one mesh, or of points of its triangles."""
+            drawn = points if points is not None and points.drawn[mesh] else None
+            used = kept if drawn is None else drawn.corners[mesh, kept].flatten()
+            weights, rest = self._weights[self._kinds[own[mesh]]][used], self._rest[own[mesh]][used]
+            body = (rest, weights, turns[mesh], joints[mesh], moved[mesh])
+            found = weights, rest, rigid_parts.skinned(*(each[None] for each in body))[0]
+            if drawn is None:
+                return found
+            return tuple(drawn.mixed(mesh, each.view(len(kept), 3, -1), kept) for each in found)
+
+        weights, rest, posed = (torch.stack(each) for each in zip(*map(at, range(len(own)), rows), strict=True))
         return Posed(weights, rest, joints, *_carried(posed, vertices, turns, moved), present)
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

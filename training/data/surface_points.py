@@ -12,6 +12,8 @@ from torch import Tensor
 
 from datagen.common.arrays import Floats
 
+_ALL = slice(None)
+
 
 class SurfacePoints(NamedTuple):
     """Points of the surfaces of some meshes, each a mixture of three vertices.
@@ -22,25 +24,28 @@ class SurfacePoints(NamedTuple):
         Numbers of the vertices [b, n, 3] int64, that with the largest share first.
     shares
         How much of each [b, n, 3] float32, in sum one.
+    drawn
+        Of which meshes [b] points were drawn; those of the others are the vertices themselves.
     """
 
     corners: Tensor
     shares: Tensor
+    drawn: tuple[bool, ...]
 
     def to(self, device: torch.device | str) -> SurfacePoints:
         """The same on another device."""
-        return SurfacePoints(self.corners.to(device), self.shares.to(device))
-
-    def at(self, mesh: int, rows: Tensor) -> SurfacePoints:
-        """Those of these numbers [k] of one of the meshes."""
-        return SurfacePoints(self.corners[mesh, rows][None], self.shares[mesh, rows][None])
+        return SurfacePoints(self.corners.to(device), self.shares.to(device), self.drawn)
 
     def of(self, values: Tensor) -> Tensor:
-        """Values [b, n, c] at the points, by those at the vertices [b, v, c], or [v, c] where they are all alike."""
-        values = values.expand(len(self.corners), -1, -1)
-        size, count = self.corners.shape[:2], values.shape[2]
-        at = self.corners.flatten(1)[..., None].expand(-1, -1, count)
-        return (values.gather(1, at).view(*size, 3, count) * self.shares[..., None].to(values.dtype)).sum(dim=2)
+        """Return values [b, n, c] at the points, from those at as many vertices of each mesh [b, n, c]."""
+        found = values.clone()
+        for mesh in np.flatnonzero(self.drawn).tolist():
+            found[mesh] = self.mixed(mesh, values[mesh, self.corners[mesh]])
+        return found
+
+    def mixed(self, mesh: int, values: Tensor, rows: Tensor | slice = _ALL) -> Tensor:
+        """Return values [k, c] at points [k] of one mesh, by number, from those at their corners [k, 3, c]."""
+        return (values * self.shares[mesh, rows, :, None].to(values.dtype)).sum(dim=1)
 
 
 class Triangles:
@@ -90,4 +95,4 @@ def points_of(
     for row, (triangles, count, own) in enumerate(zip(meshes, counts, random, strict=True)):
         if chosen[row]:
             corners[row, :count], shares[row, :count] = triangles.drawn(count, own)
-    return SurfacePoints(corners, shares)
+    return SurfacePoints(corners, shares, tuple(chosen))

@@ -64,7 +64,7 @@ def test_values_are_mixed_by_shares_and_padding_stays() -> None:
     vertices = torch.randn((2, 6, 3), generator=random(3))
     for found in (
         points.of(vertices),
-        torch.cat([points.at(mesh, torch.arange(6)).of(vertices[mesh]) for mesh in (0, 1)]),
+        torch.stack([points.mixed(mesh, vertices[mesh, points.corners[mesh]]) for mesh in (0, 1)]),
     ):
         for mesh, count in enumerate((4, 3)):
             mixed = torch.stack([vertices[mesh, own] for own in points.corners[mesh].T], dim=1)
@@ -91,14 +91,15 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
             whole, points = torch.from_numpy(legs.vertices(identity, pose)), batch.points[min(side, 1)]
             low, high = whole.aminmax(dim=0)
             boxed = (whole - (low + high) / 2) / ((high - low).max() / 2)
-            expected = points.at(row, rows[row]).of(boxed)[0]
+            corners = points.corners[row, rows[row]]
+            expected = points.mixed(row, boxed[corners], rows[row])
             torch.testing.assert_close(meshes[row], expected, rtol=0, atol=1e-3)
             if side < 2:
                 rig = legs.rig(identity)
                 assert rig is not None
                 cells = surface_of_topology(legs, identity)[points.corners[row, rows[row], 0]]
                 assert torch.equal(batch.surfaces[side].cells[row], cells), "that of the nearest corner"
-                weights = points.at(row, rows[row]).of(torch.from_numpy(rig.weights).float())[0]
+                weights = points.mixed(row, torch.from_numpy(rig.weights).float()[corners], rows[row])
                 torch.testing.assert_close(batch.posed[side].weights[row], weights, rtol=0, atol=1e-5)
     for with_points, without in zip(batch.posed, plain.posed, strict=True):  # the same bodies in the same poses
         torch.testing.assert_close(with_points.rotations, without.rotations, rtol=0, atol=5e-4)
