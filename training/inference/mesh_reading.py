@@ -33,7 +33,7 @@ class _Filter(NamedTuple):
 
 
 _STRONG, _WEAK = _Filter(8, 0.9), _Filter(2, 0.85)
-"""Of people, and of animals and coarse meshes, of which the former takes too much (docs/networks.md)."""
+"""Of people, and of animals and coarse meshes, of which the former takes too much (docs/results/parts.md)."""
 _COARSE, _ALIKE = 500, 1.5
 """Vertices of a mesh, up to which its filter is weak; how many times as many as the source a target may have, or the
 source as the target, where outputs are read through the strong filter, too.

@@ -37,7 +37,7 @@ from training.recipes.networks import PEOPLE
 _VARIANCE_FLOOR = 1e-5
 _SURELY_CORRECTED = 0.1
 """Sum of squares over the rotations' numbers up to which a correction is taken unread, as it was better each time that
-it was read (docs/networks.md).
+it was read (docs/results/parts.md).
 """
 
 
