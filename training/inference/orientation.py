@@ -8,7 +8,7 @@ meshes as given.
 
 It is not certain of a mesh that stands between the axes, which comes back better when it is turned a little further,
 nor of one that the network does not know, as an animal by a network of humans, for which some way comes back least
-badly. The thresholds are from the measurements in docs/transfer.md.
+badly. The thresholds are from the measurements in docs/results/transfer.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ SelfErrors = Callable[[Floats], NDArray[np.float64]]
 """Meshes [b, n, 3] in the normalised box -> PMD [b] of each when it is transferred onto itself."""
 
 NAMES = ("X", "Y", "Z", "-X", "-Y", "-Z")
-_PROBED_VERTICES = 256  # of a mesh: so many tell the 24 ways apart as well as 512 do (docs/transfer.md)
+_PROBED_VERTICES = 256  # of a mesh: so many tell the 24 ways apart as well as 512 do (docs/results/transfer.md)
 POOR_ERROR = 0.01
 """PMD of a mesh onto itself, at most, where the network knows it and it stands right: 0.1 of half the box, in every
 coordinate."""

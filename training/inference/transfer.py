@@ -39,7 +39,7 @@ from training.objectives.metrics import point_mesh_distance
 
 _VERTICES_AT_ONCE = 8192  # of self-transfers, so that memory stays bounded
 REFINE_WEIGHT = 6.0
-"""The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/transfer.md)."""
+"""The least PMD and nearly the least edge error on the quickstart's unseen triples (docs/results/transfer.md)."""
 Stands = Axes | Standing | None
 _NO_LENGTH = 1e-9  # of the normalised box: an edge that has none says nothing of the scale
 

@@ -7,6 +7,7 @@ the surface is long. Vertices are gathered into cells, and of cells it is known 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -101,29 +102,50 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     """
     vertices = np.asarray(vertices, np.float64)
     _, first, point_of = np.unique(vertices @ _ELSEWHERE, return_index=True, return_inverse=True)
-    placed, count = np.nan_to_num(bounding_box(vertices).normalise(vertices[first])), len(first)
-    edges = point_of[edges]
-    piece = _joined_by(edges, count)
-    is_crumb = (np.bincount(piece) < _CRUMB * count)[piece]
-    cells = np.zeros(count, np.int64)
-    for size in _CUBES:
-        cube = np.unique(np.floor(placed / size).astype(np.int64) @ (1, 1 << 20, 1 << 40), return_inverse=True)[1]
-        found = _joined_by(edges[cube[edges[:, 0]] == cube[edges[:, 1]]], count)
-        found = np.unique(np.where(is_crumb, -1, found), return_inverse=True)[1]
-        if found.max() < _MOST_CELLS:
-            cells = found
-            break
-    number = int(cells.max()) + 1
-    filled = np.bincount(cells)
-    middles = np.stack([np.bincount(cells, axis) for axis in placed.T], axis=1) / filled[:, None]
-    one, other = np.divmod(np.unique(cells[edges[:, 0]] * number + cells[edges[:, 1]]), number)
-    one, other = one[one != other], other[one != other]
-    lengths = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-9
-    ways = dijkstra(csr_array((lengths, (one, other)), (number, number)), directed=False, limit=_FAR)
-    of_cell = np.zeros(number, np.int64)
-    of_cell[cells] = np.where(is_crumb, -1, piece)
-    near = np.isfinite(ways) | (of_cell[:, None] != of_cell) | (of_cell < 0)
+    placed, edges = np.nan_to_num(bounding_box(vertices).normalise(vertices[first])), point_of[edges]
+    found = next((found for size in _CUBES if (found := _Cells.of(placed, edges, size)).count <= _MOST_CELLS), None)
+    cells = np.zeros(len(placed), np.int64) if found is None else found.cells
+    near = np.ones((1, 1), np.bool_) if found is None else found.near(placed)
     return Surface(torch.from_numpy(cells[point_of])[None], torch.from_numpy(near)[None])
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """The cell [n] of each point; edges [e, 2] between cells; the piece [cell] that each belongs to, -1: crumbs."""
+
+    cells: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    pieces: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, placed: NDArray[np.float64], edges: NDArray[np.integer], size: float) -> _Cells:
+        """Those of points [n, 3], joined by edges, in cubes of a size; crumbs are one cell, the first."""
+        cube = np.unique(np.floor(placed / size).astype(np.int64) @ (1, 1 << 20, 1 << 40), return_inverse=True)[1]
+        cells = _joined_by(edges[cube[edges[:, 0]] == cube[edges[:, 1]]], len(placed))
+        filled = np.bincount(cells)
+        between = np.unique(cells[edges[:, 0]] * len(filled) + cells[edges[:, 1]])
+        between = np.stack(np.divmod(between, len(filled)), axis=1)
+        pieces = _joined_by(between, len(filled))
+        pieces = np.where((np.bincount(pieces, filled) < _CRUMB * len(placed))[pieces], -1, pieces)
+        number = np.where(pieces < 0, -1, np.arange(len(filled)))
+        kept, number = np.unique(number, return_inverse=True)
+        between = number[between]
+        return cls(number[cells], between[between[:, 0] != between[:, 1]], np.where(kept < 0, -1, pieces[kept]))
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.pieces)
+
+    def near(self, placed: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which cells [cell, cell] a way along the surface joins that is not long, or none at all."""
+        filled = np.bincount(self.cells)
+        middles = np.stack([np.bincount(self.cells, axis) for axis in placed.T], axis=1) / filled[:, None]
+        one, other = self.edges.T
+        lengths = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-9
+        graph = csr_array((lengths, (one, other)), (self.count, self.count))
+        ways = dijkstra(graph, directed=False, limit=_FAR)
+        return np.isfinite(ways) | (self.pieces[:, None] != self.pieces) | (self.pieces < 0)
 
 
 def _joined_by(edges: NDArray[np.integer], count: int) -> NDArray[np.int64]:
