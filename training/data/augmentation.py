@@ -18,6 +18,7 @@ from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
 from training.data.triples import Triples
 from training.networks.layers.rigid_parts import about_vertical, turned_about
+from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
 from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingRecipe
@@ -66,7 +67,7 @@ class Augmentation:
         if recipe.vertices < 1:
             batch = _some_of_the_source(batch, recipe.vertices, random)
         if recipe.subset:
-            batch = self._subset(batch, recipe.subset, random)
+            batch = self._subset(triples, batch, recipe.subset, random)
         batch = self._told(triples, batch)
         if batch.surfaces:
             batch = _without_some_surfaces(batch, random)
@@ -79,13 +80,15 @@ class Augmentation:
     def _told(self, triples: Triples, batch: Batch) -> Batch:
         return self._rigs.posed(triples, batch) if self._rigs else batch
 
-    def _subset(self, batch: Batch, size: int, random: Sequence[torch.Generator]) -> Batch:
+    def _subset(self, triples: Triples, batch: Batch, size: int, random: Sequence[torch.Generator]) -> Batch:
         """So many vertices of each source and each target; more often than once where a mesh has fewer."""
         targets = batch.target_counts or (batch.target.shape[1],) * len(batch)
-        source = torch.stack([_drawn(count, size, own) for count, own in zip(_counts(batch), random, strict=True)])
+        of_source = zip(_counts(batch), random, self._areas(triples, batch, 0), strict=True)
+        source = torch.stack([_drawn(count, size, own, areas) for count, own, areas in of_source])
+        of_target = zip(targets, random, self._areas(triples, batch, 1), strict=True)
         drawn = [
-            self._target(_edges_of(batch, row) if self._draws_edges else _NO_EDGES, count, size, own)
-            for row, (count, own) in enumerate(zip(targets, random, strict=True))
+            self._target(_edges_of(batch, row) if self._draws_edges else _NO_EDGES, count, size, own, areas)
+            for row, (count, own, areas) in enumerate(of_target)
         ]
         target, pairs = torch.stack([rows for rows, _ in drawn]), [own for _, own in drawn]
         meshes = torch.cat([torch.full_like(own[:, 0], mesh) for mesh, own in enumerate(pairs)])
@@ -102,13 +105,31 @@ class Augmentation:
             target_rows=target,
         )
 
-    def _target(self, edges: Tensor, count: int, size: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _areas(self, triples: Triples, batch: Batch, side: int) -> list[Tensor | None]:
+        """The area around each vertex [n] of the sources (0) or targets (1) that a network thins out as it reads them.
+
+        None: of meshes with fewer vertices, of points, which lie evenly, and where no rigs are known.
+        """
+        identities, rows = triples[:, 2 * side], (batch.source_rows, batch.target_rows)[side]
+        found = list[Tensor | None]()
+        for row, identity in enumerate(identities.tolist()):
+            areas = self._rigs.areas(identity) if self._rigs else None
+            is_points = batch.points is not None and batch.points[side].drawn[row]
+            if areas is None or len(areas) <= MOST_SAMPLED or is_points:
+                found.append(None)
+            else:
+                found.append(areas if rows is None else areas[rows[row]])
+        return found
+
+    def _target(
+        self, edges: Tensor, count: int, size: int, random: torch.Generator, areas: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Vertices [size] of a target, and edges [e, 2] by their places there: a quarter as many, with their ends.
 
         Of a target that has no more vertices than that all are taken, with all edges.
         """
         if not self._draws_edges:
-            return _drawn(count, size, random), edges[:0]
+            return _drawn(count, size, random, areas), edges[:0]
         if count <= size:
             rows = _drawn(count, size, random)
             return rows, torch.argsort(rows[:count])[edges]
@@ -130,8 +151,10 @@ def _taken(vertices: Tensor, rows: Tensor) -> Tensor:
     return vertices.gather(1, rows[..., None].expand(-1, -1, 3))
 
 
-def _drawn(count: int, size: int, random: torch.Generator) -> Tensor:
-    """So many numbers below ``count``, none twice where there are enough."""
+def _drawn(count: int, size: int, random: torch.Generator, areas: Tensor | None = None) -> Tensor:
+    """So many numbers below ``count``, none twice where there are enough: by the areas [n] around them, or alike."""
+    if areas is not None and count > size:
+        return torch.multinomial(areas[:count].clamp_min(1e-12), size, generator=random)
     order = torch.randperm(count, generator=random, device=random.device)
     more = torch.randint(count, (max(0, size - count),), generator=random, device=random.device)
     return torch.cat([order[:size], more])

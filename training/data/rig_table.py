@@ -98,6 +98,10 @@ class RigTable:
         )
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
+    def areas(self, identity: int) -> Tensor:
+        """What share of the area lies around each vertex [v] of an identity at rest."""
+        return self._triangles[self._kinds[self._row[identity]]].areas
+
     def of_points(self, triples: Triples, batch: Batch, chance: float, random: Sequence[torch.Generator]) -> Batch:
         """The batch, each source and each target (with its truth) with this chance as points of its surface."""
         drawn = [

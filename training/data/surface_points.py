@@ -57,12 +57,19 @@ class Triangles:
         [v, 3] of a body at rest, in any unit: areas are those at rest.
     faces
         [f, 3].
+
+    Attributes
+    ----------
+    areas
+        What share of the area lies around each vertex [v].
     """
 
     def __init__(self, vertices: Floats, faces: NDArray[np.integer], *, device: torch.device) -> None:
         a, b, c = np.asarray(vertices, np.float64)[faces].swapaxes(0, 1)
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-30  # a mesh without area has points, too
         self._faces = torch.from_numpy(np.asarray(faces, np.int64)).to(device)
+        around = np.bincount(np.asarray(faces).ravel(), np.repeat(areas / 3, 3), len(vertices))
+        self.areas = torch.from_numpy(around / around.sum()).float().to(device)
         self._below = torch.from_numpy(np.cumsum(areas / areas.sum())).float().to(device)
 
     def drawn(self, count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:

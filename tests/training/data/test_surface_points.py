@@ -106,6 +106,25 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
         torch.testing.assert_close(with_points.joints, without.joints, rtol=0, atol=5e-4)
 
 
+def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
+    legs: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("training.data.augmentation.MOST_SAMPLED", 10)
+    identities = legs.identities("training")
+    rigs = RigTable(legs, identities, LEG, device="cpu")
+    whole = open_bank(legs, identities).batch(TRIPLES)
+    recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 8}})
+    drawn = [Augmentation(recipe, rigs)(TRIPLES, whole, step=step, first=0) for step in range(400)]
+    areas = rigs.areas(int(TRIPLES[0, 0]))
+    assert areas.sum() == pytest.approx(1, abs=1e-5)
+    large = areas > areas.median()
+    assert areas.max() > 1.2 * areas.min(), "else this would show nothing"
+    for rows in ([each.source_rows for each in drawn], [each.target_rows for each in drawn]):
+        numbers = torch.stack([own for own in rows if own is not None])
+        assert all(len(set(own)) == 8 for own in numbers.flatten(0, 1).tolist())
+        assert large[numbers].float().mean() == pytest.approx(float(areas[large].sum()), abs=0.03)
+
+
 def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
     rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)

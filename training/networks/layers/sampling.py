@@ -24,7 +24,8 @@ _CELL = 1 / 32
 than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
-_MOST = 1024
+MOST_SAMPLED = 1024
+"""Vertices of a mesh that are sampled at most."""
 _AT_ONCE, _REGION = 512, 0.25
 """So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
 longest edge of a mesh' box being 1."""
@@ -166,7 +167,9 @@ def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]
     first = torch.ones_like(ordered, dtype=torch.bool)
     first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
     off = off.gather(1, order)
-    count = vertices.shape[1] if vertices.shape[1] <= _MOST else _MOST  # of a min() torch.export would understand less
+    count = (
+        vertices.shape[1] if vertices.shape[1] <= MOST_SAMPLED else MOST_SAMPLED
+    )  # of a min() torch.export would understand less
     kept = torch.where(first, -off, -9.0).topk(count, dim=1)
     return order.gather(1, kept.indices), kept.values > -9
 
