@@ -36,6 +36,7 @@ _LOST = (
     "from the newest checkpoint"
 )
 _WHERE_THEY_MEET = ("EADDRINUSE", "Unable to find address")  # the same command fails the same way
+_JOIN_SECONDS = 120.0  # for machines that a cluster lost: one that was cut off comes back after a minute or so
 _ASK_SECONDS = 60.0  # that a cluster has to say whether its torch uses its GPUs
 
 
@@ -66,7 +67,7 @@ def _with_ray(recipe: TrainingRecipe, data: str, run: Path) -> None:
     if not gpu:
         recipe = recipe.model_copy(update={"device": "cpu"})
     resource = "GPU" if gpu else "CPU"
-    require_enough(recipe, _count(resource), resource)
+    require_enough(recipe, lambda: _count(resource), resource, patience=_join_seconds())
     fewest = f"{recipe.fewest_ranks} to " if recipe.fewest_ranks else ""
     _say(f"{fewest}{recipe.ranks} ranks by Ray", "one GPU each (NCCL)" if gpu else "CPUs (Gloo)")
     run.mkdir(parents=True, exist_ok=True)
@@ -230,8 +231,17 @@ def _count(resource: str) -> int:
     return int(ray.cluster_resources().get(resource, 0))
 
 
-def require_enough(recipe: TrainingRecipe, available: int, resource: str) -> None:
-    """Raise if a cluster has fewer CPUs or GPUs than the recipe has ranks.
+def _join_seconds() -> float:
+    """How long to wait for machines: those of a cluster, all that it ever had, may be cut off and come back."""
+    import ray
+
+    return _JOIN_SECONDS if len(ray.nodes()) > 1 else 0.0
+
+
+def require_enough(
+    recipe: TrainingRecipe, available: Callable[[], int], resource: str, *, patience: float = 0.0
+) -> None:
+    """Raise if a cluster has fewer CPUs or GPUs than the recipe has ranks, and gets no more in some seconds.
 
     Raises
     ------
@@ -239,12 +249,15 @@ def require_enough(recipe: TrainingRecipe, available: int, resource: str) -> Non
         It has; the message names the key to change.
     """
     key = "fewest_ranks" if recipe.fewest_ranks else "ranks"
-    wanted = getattr(recipe, key)
-    if available < wanted:
-        raise TrainingError(
-            f"training.{key} is {wanted}, but the cluster has {available} {resource}s. "
-            f"Use --set training.{key}={max(1, available)}, or add machines"
-        )
+    wanted, until, waits = getattr(recipe, key), time.monotonic() + patience, False
+    while (count := available()) < wanted:
+        short = f"training.{key} is {wanted}, but the cluster has {count} {resource}s"
+        if time.monotonic() >= until:
+            raise TrainingError(f"{short}. Use --set training.{key}={max(1, count)}, or add machines")
+        if not waits:
+            print(f"train: {short}; waiting up to {patience:g} s for machines", file=sys.stderr, flush=True)
+        waits = True
+        time.sleep(1.0)
 
 
 def main() -> None:

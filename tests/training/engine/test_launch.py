@@ -85,8 +85,8 @@ def test_room_for_a_failure_is_kept_while_ranks_train(
         if error:
             raise error
 
-    monkeypatch.setattr(launch, "require_enough", lambda *_: None)
-    monkeypatch.setattr(launch, "_count", lambda _: 2)
+    monkeypatch.setattr(launch, "require_enough", lambda *_, **__: None)
+    monkeypatch.setattr(launch, "_join_seconds", lambda: 0.0)
     monkeypatch.setattr(launch, "_group", lambda *_, **__: SimpleNamespace(fit=fit))
     monkeypatch.setattr(launch, "fit_while_progressing", lambda fit, _: fit())
     with pytest.raises(TrainingError) if error else nullcontext():
@@ -129,7 +129,19 @@ def test_gpus_are_the_clusters(changes: dict[str, int], gpus: int, torch_sees_th
 def test_too_few_machines_are_said_by_the_key_that_asks(changes: dict[str, int], key: str) -> None:
     recipe = tiny_training(launcher="ray", ranks=4, **changes)
     with pytest.raises(TrainingError, match=rf"training\.{key}, but the cluster has 2 CPUs"):
-        launch.require_enough(recipe, 2, "CPU")
+        launch.require_enough(recipe, lambda: 2, "CPU")
+
+
+def test_machines_that_were_cut_off_are_waited_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    recipe, counts = tiny_training(launcher="ray", ranks=4), iter([1, 1, 2, 4])
+    launch.require_enough(recipe, lambda: next(counts), "CPU", patience=90)
+    waited = "train: training.ranks is 4, but the cluster has 1 CPUs; waiting up to 90 s for machines\n"
+    assert capsys.readouterr().err == waited
+    with pytest.raises(TrainingError, match=r"but the cluster has 3 CPUs\. Use --set training\.ranks=3"):
+        launch.require_enough(recipe, lambda: 3, "CPU", patience=0.02)
 
 
 @pytest.mark.parametrize("whole", [True, False])
