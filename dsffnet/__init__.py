@@ -38,7 +38,7 @@ def transfer(
         are not changed.
     model
         A run folder, weights, ``models:/NAME@ALIAS`` (of the server MLFLOW_TRACKING_URI), or the name of weights that
-        come along; by default those of people or of animals, by the meshes.
+        come along; by default `human`, `dressed` or `animals`, by the meshes.
     refine
         Pull the edges back to the target's.
     align
