@@ -232,7 +232,7 @@ def _count(resource: str) -> int:
 
 
 def _join_seconds() -> float:
-    """How long to wait for machines: those of a cluster, all that it ever had, may be cut off and come back."""
+    """Seconds to wait for machines that may be cut off and come back: none in a cluster that never had two."""
     import ray
 
     return _JOIN_SECONDS if len(ray.nodes()) > 1 else 0.0
@@ -241,7 +241,16 @@ def _join_seconds() -> float:
 def require_enough(
     recipe: TrainingRecipe, available: Callable[[], int], resource: str, *, patience: float = 0.0
 ) -> None:
-    """Raise if a cluster has fewer CPUs or GPUs than the recipe has ranks, and gets no more in some seconds.
+    """Raise if a cluster has fewer CPUs or GPUs than the recipe has ranks, and does not get enough meanwhile.
+
+    Parameters
+    ----------
+    available
+        How many the cluster has now.
+    resource
+        CPU or GPU; it names them in messages.
+    patience
+        Seconds to wait for more.
 
     Raises
     ------

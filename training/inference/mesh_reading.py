@@ -26,7 +26,7 @@ from training.recipes.networks import PEOPLE
 
 
 class _Filter(NamedTuple):
-    """How often a mesh is low-passed, and less than what part of its misfit has to be left where it is read so."""
+    """How often a mesh is low-passed, and the share of its misfit below which that has to bring it, to be read so."""
 
     times: int
     left: float

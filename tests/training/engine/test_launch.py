@@ -144,6 +144,21 @@ def test_machines_that_were_cut_off_are_waited_for(
         launch.require_enough(recipe, lambda: 3, "CPU", patience=0.02)
 
 
+@pytest.mark.parametrize(("nodes", "waits"), [(1, False), (2, True)])
+def test_only_a_cluster_of_several_machines_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nodes: int, waits: bool
+) -> None:
+    """Alive or not: a machine that was lost may come back, and one alone has what it has."""
+    import ray
+
+    patience: list[float] = []
+    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": number == 0} for number in range(nodes)])
+    monkeypatch.setattr(launch, "require_enough", lambda *_, **told: patience.append(told["patience"]))
+    monkeypatch.setattr(launch, "_group", lambda *_, **__: SimpleNamespace(fit=lambda: None))
+    launch._with_ray(TrainingRecipe(ranks=2, device="cpu"), "data.zarr", tmp_path)
+    assert len(patience) == 1 and (patience[0] >= 60) == waits
+
+
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_a_section_or_a_whole_recipe_with_words(tmp_path: Path, whole: bool, suffix: str) -> None:

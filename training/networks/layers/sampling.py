@@ -167,9 +167,8 @@ def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]
     first = torch.ones_like(ordered, dtype=torch.bool)
     first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
     off = off.gather(1, order)
-    count = (
-        vertices.shape[1] if vertices.shape[1] <= MOST_SAMPLED else MOST_SAMPLED
-    )  # of a min() torch.export would understand less
+    # of a min() torch.export would understand less
+    count = vertices.shape[1] if vertices.shape[1] <= MOST_SAMPLED else MOST_SAMPLED
     kept = torch.where(first, -off, -9.0).topk(count, dim=1)
     return order.gather(1, kept.indices), kept.values > -9
 

@@ -145,7 +145,9 @@ class _Cells:
         lengths = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-9
         graph = csr_array((lengths, (one, other)), (self.count, self.count))
         ways = dijkstra(graph, directed=False, limit=_FAR)
-        return np.isfinite(ways) | (self.pieces[:, None] != self.pieces) | (self.pieces < 0)
+        return np.isfinite(ways) | (
+            self.pieces[:, None] != self.pieces
+        )  # so crumbs are near all: their piece is no other's
 
 
 def _joined_by(edges: NDArray[np.integer], count: int) -> NDArray[np.int64]:

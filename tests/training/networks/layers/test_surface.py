@@ -182,3 +182,18 @@ def test_surfaces_of_several_meshes_are_padded() -> None:
     expected = small.near[0][small.cells[0]][:, small.cells[0, rows[0]]]
     assert torch.equal(of_cells(small.apart(rows), small.cells)[0] == 0, expected)
     assert torch.equal(small.at(rows).cells, small.cells[:, rows[0]])
+
+
+def test_crumbs_are_one_cell_that_is_near_to_all() -> None:
+    """Triangles that share no vertices would else be cells each, and nothing near anything."""
+    mesh, random = hairpin(60), np.random.default_rng(0)
+    low, high = 0.9 * mesh.vertices.min(axis=0), 0.9 * mesh.vertices.max(axis=0)
+    crumbs = random.uniform(low, high, (20, 1, 3)) + 0.001 * random.normal(size=(20, 3, 3))
+    vertices = np.concatenate([mesh.vertices, crumbs.reshape(-1, 3)])
+    faces = np.concatenate([mesh.faces, len(mesh.vertices) + np.arange(60).reshape(20, 3)])
+    alone, both = (surface_of(each, edges_of(its)) for each, its in ((mesh.vertices, mesh.faces), (vertices, faces)))
+    assert both.near.shape[1] == alone.near.shape[1] + 1
+    assert len(set(both.cells[0, len(mesh.vertices) :].tolist())) == 1
+    assert near(Mesh(vertices, faces))[len(mesh.vertices) :].all()
+    found = near(Mesh(vertices, faces))[: len(mesh.vertices), : len(mesh.vertices)]
+    assert (found == near(mesh)).all()
