@@ -106,9 +106,10 @@ class Augmentation:
         )
 
     def _areas(self, triples: Triples, batch: Batch, side: int) -> list[Tensor | None]:
-        """The area around each vertex [n] of the sources (0) or targets (1) that a network thins out as it reads them.
+        """The area around each vertex [n] of the sources (0) or targets (1) of which some are drawn by it.
 
-        None: of meshes with fewer vertices, of points, which lie evenly, and where no rigs are known.
+        These are meshes of more vertices than a network samples, of which it leaves out most in faces and hands, too.
+        None: of meshes with fewer, of points, which lie evenly, and where no rigs are known.
         """
         identities, rows = triples[:, 2 * side], (batch.source_rows, batch.target_rows)[side]
         found = list[Tensor | None]()
@@ -152,7 +153,10 @@ def _taken(vertices: Tensor, rows: Tensor) -> Tensor:
 
 
 def _drawn(count: int, size: int, random: torch.Generator, areas: Tensor | None = None) -> Tensor:
-    """So many numbers below ``count``, none twice where there are enough: by the areas [n] around them, or alike."""
+    """So many numbers below ``count``, none twice where there are enough: by the areas [n] around them, or alike.
+
+    Where there are not, all are taken, whatever the areas.
+    """
     if areas is not None and count > size:
         return torch.multinomial(areas[:count].clamp_min(1e-12), size, generator=random)
     order = torch.randperm(count, generator=random, device=random.device)

@@ -99,7 +99,7 @@ class RigTable:
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
     def areas(self, identity: int) -> Tensor:
-        """What share of the area lies around each vertex [v] of an identity at rest."""
+        """What share of the area at rest lies around each vertex [v] of the first identity with this one's weights."""
         return self._triangles[self._kinds[self._row[identity]]].areas
 
     def of_points(self, triples: Triples, batch: Batch, chance: float, random: Sequence[torch.Generator]) -> Batch:

@@ -138,7 +138,7 @@ class AugmentationRecipe(Frozen):
         None,
         ge=8,
         description="vertices of source and of target that a step takes, others each time (edges of the loss are drawn "
-        "with them); a step's time falls with them",
+        "with them); a step's time falls with them. Network parts: of meshes of more than 1,024 vertices by area",
     )
     turn: float = Field(
         0.0,

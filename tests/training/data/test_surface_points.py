@@ -48,7 +48,9 @@ def augmented(legs: Dataset, **changes: float) -> Batch:
 
 
 def test_points_are_even_by_area() -> None:
-    corners, shares = Triangles(CORNERS, FACES, device=CPU).drawn(20_000, random(0))
+    triangles = Triangles(CORNERS, FACES, device=CPU)
+    np.testing.assert_allclose(triangles.areas, [1 / 3, 1 / 4, 1 / 3, 1 / 12], atol=1e-6)
+    corners, shares = triangles.drawn(20_000, random(0))
     assert (shares >= 0).all() and torch.allclose(shares.sum(dim=1), torch.ones(20_000))
     assert (shares.diff(dim=1) <= 0).all(), "the largest share first"
     at = (torch.from_numpy(CORNERS).float()[corners] * shares[..., None]).sum(dim=1).numpy()
@@ -123,6 +125,39 @@ def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
         numbers = torch.stack([own for own in rows if own is not None])
         assert all(len(set(own)) == 8 for own in numbers.flatten(0, 1).tolist())
         assert large[numbers].float().mean() == pytest.approx(float(areas[large].sum()), abs=0.03)
+
+
+def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of meshes of 32 and 30 vertices; all of the area lies around every fourth vertex, others for each identity."""
+    mixed = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
+    identities = mixed.identities("training")
+    bank, rigs = open_bank(mixed, identities), RigTable(mixed, identities, LEG, device="cpu")
+    monkeypatch.setattr("training.data.augmentation.MOST_SAMPLED", 30)
+    monkeypatch.setattr(
+        RigTable,
+        "areas",
+        lambda _, identity: (torch.arange(mixed.vertex_count(identity)) % 4 == identity % 4).float(),
+    )
+    triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [3, 2, 0, 1]])
+    dense = np.array([[mixed.vertex_count(int(own)) > 30 for own in pair] for pair in triples[:, [0, 2]]])
+    assert dense.any(axis=0).all() and not dense.all(axis=0).any()
+
+    def shares(**changes: float) -> np.ndarray:
+        """Share of the drawn vertices around which the area lies, of each source and target [triple, 2]."""
+        recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 8, **changes}})
+        found = []
+        for step in range(40):
+            batch = Augmentation(recipe, rigs)(triples, bank.batch(triples), step=step, first=0)
+            rows = torch.stack([own for own in (batch.source_rows, batch.target_rows) if own is not None], dim=1)
+            found.append(rows % 4 == torch.from_numpy(triples[:, [0, 2], None] % 4))
+        return torch.stack(found).float().mean(dim=(0, 3)).numpy()
+
+    plain, cut, points = shares(), shares(source_holes=0.8), shares(points=1.0)
+    assert (plain[dense] == 1).all() and (plain[~dense] < 0.5).all()
+    assert (cut[dense[:, 1], 1] == 1).all() and (cut[dense[:, 0], 0] > 0.75).all() and (cut[~dense] < 0.5).all()
+    assert (points < 0.5).all()
 
 
 def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
