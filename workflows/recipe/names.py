@@ -17,7 +17,7 @@ def known_files(kind: str = "") -> dict[str, Path]:
 
 def known_recipes() -> dict[str, Path]:
     """Files of whole recipes, by name."""
-    return dict(sorted((known_files() | known_files("clothed") | known_files("papers")).items()))
+    return dict(sorted((known_files() | known_files("clothed") | known_files("papers") | known_files("parts")).items()))
 
 
 def known_trainings() -> dict[str, Path]:
