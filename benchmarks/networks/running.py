@@ -49,7 +49,8 @@ def backward(network: nn.Module, how: Precision, meshes: Meshes) -> None:
     with products(how):
         with autocast(how, meshes.source.device):
             prediction = network(source=meshes.source, target=meshes.target)
-        transfer_loss(prediction, truth=meshes.truth, target=meshes.target, edges=meshes.edges)[0].backward()
+        # the literal form leaves its output rounded
+        transfer_loss(prediction.float(), truth=meshes.truth, target=meshes.target, edges=meshes.edges)[0].backward()
 
 
 def step(network: nn.Module, how: Precision, optimiser: torch.optim.Optimizer, meshes: Meshes) -> None:

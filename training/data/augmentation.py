@@ -11,14 +11,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from datagen.common.seeding import Stream
 from training.data.batch import Batch, Counts, counts_of
 from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
+from training.data.row_random import Purpose, RowRandom
 from training.data.triples import Triples
+from training.networks.execution import sent
 from training.networks.layers.rigid_parts import about_vertical, turned_about
-from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
 from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingRecipe
@@ -27,7 +29,7 @@ from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingR
 class Augmentation:
     """The augmentation of a recipe, a function of (seed, step, place of the triple in the whole batch).
 
-    So it is the same for any number of ranks and parts and from any cache. A CPU and a GPU draw different numbers.
+    So it is the same for any number of ranks and parts, from any cache and, but for rounding, on any device.
 
     Parameters
     ----------
@@ -54,10 +56,10 @@ class Augmentation:
         first
             Place of the batch's first triple in the whole batch (:meth:`training.data.triples.TripleOrder.places`).
         """
-        recipe, device = self._recipe, batch.source.device
+        recipe = self._recipe
         if recipe == AugmentationRecipe(shuffle=recipe.shuffle):
             return self._told(triples, batch)
-        random = [_generator(self._seed, step, first + row, device) for row in range(len(batch))]
+        random = RowRandom(self._seed, step, first=first, rows=len(batch), device=batch.source.device)
         if recipe.points and self._rigs:
             batch = self._rigs.of_points(triples, batch, recipe.points, random)
         if recipe.turn or recipe.lean:
@@ -80,159 +82,156 @@ class Augmentation:
     def _told(self, triples: Triples, batch: Batch) -> Batch:
         return self._rigs.posed(triples, batch) if self._rigs else batch
 
-    def _subset(self, triples: Triples, batch: Batch, size: int, random: Sequence[torch.Generator]) -> Batch:
-        """So many vertices of each source and each target; more often than once where a mesh has fewer."""
-        targets = batch.target_counts or (batch.target.shape[1],) * len(batch)
-        of_source = zip(_counts(batch), random, self._areas(triples, batch, 0), strict=True)
-        source = torch.stack([_drawn(count, size, own, areas) for count, own, areas in of_source])
-        of_target = zip(targets, random, self._areas(triples, batch, 1), strict=True)
-        drawn = [
-            self._target(_edges_of(batch, row) if self._draws_edges else _NO_EDGES, count, size, own, areas)
-            for row, (count, own, areas) in enumerate(of_target)
-        ]
-        target, pairs = torch.stack([rows for rows, _ in drawn]), [own for _, own in drawn]
-        meshes = torch.cat([torch.full_like(own[:, 0], mesh) for mesh, own in enumerate(pairs)])
-        packed = PackedEdges(torch.cat([own + size * mesh for mesh, own in enumerate(pairs)]), meshes)
+    def _subset(self, triples: Triples, batch: Batch, size: int, random: RowRandom) -> Batch:
+        """So many vertices of each source and each target; more often than once where a mesh has fewer.
+
+        With them go a quarter as many edges of each target, and these edges' ends.
+        """
+        of_source, of_target = self._rigs.areas(triples, batch) if self._rigs else (None, None)
+        counts = _counts(batch.source, batch.source_counts)
+        source = _drawn(random, _OF_SOURCES, counts, batch.source.shape[1], size, areas=of_source)
+        counts, rows = _counts(batch.target, batch.target_counts), batch.target.shape[1]
+        ends = _edges_drawn(batch, size // 4 if self._draws_edges else 0, random)
+        target = _drawn(random, _OF_TARGETS, counts, rows, size, areas=of_target, always=ends.flatten(1))
         return replace(
             batch,
             source=_taken(batch.source, source),
             target=_taken(batch.target, target),
             truth=_taken(batch.truth, target),
-            edges=packed,
+            edges=_among(target, counts, ends, rows),
             source_counts=None,
             target_counts=None,
             source_rows=source if batch.source_rows is None else batch.source_rows.gather(1, source),
             target_rows=target,
         )
 
-    def _areas(self, triples: Triples, batch: Batch, side: int) -> list[Tensor | None]:
-        """The area around each vertex [n] of the sources (0) or targets (1) of which some are drawn by it.
 
-        These are meshes of more vertices than a network samples, of which it leaves out most in faces and hands, too.
-        None: of meshes with fewer, of points, which lie evenly, and where no rigs are known.
-        """
-        identities, rows = triples[:, 2 * side], (batch.source_rows, batch.target_rows)[side]
-        found = list[Tensor | None]()
-        for row, identity in enumerate(identities.tolist()):
-            areas = self._rigs.areas(identity) if self._rigs else None
-            is_points = batch.points is not None and batch.points[side].drawn[row]
-            if areas is None or len(areas) <= MOST_SAMPLED or is_points:
-                found.append(None)
-            else:
-                found.append(areas if rows is None else areas[rows[row]])
-        return found
-
-    def _target(
-        self, edges: Tensor, count: int, size: int, random: torch.Generator, areas: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Vertices [size] of a target, and edges [e, 2] by their places there: a quarter as many, with their ends.
-
-        Of a target that has no more vertices than that all are taken, with all edges.
-        """
-        if not self._draws_edges:
-            return _drawn(count, size, random, areas), edges[:0]
-        if count <= size:
-            rows = _drawn(count, size, random)
-            return rows, torch.argsort(rows[:count])[edges]
-        chosen = edges[torch.randint(len(edges), (size // 4,), generator=random, device=edges.device)]
-        ends = torch.unique(chosen)
-        others = torch.randperm(count, generator=random, device=edges.device)
-        rows = torch.cat([ends, others[~torch.isin(others, ends)][: size - len(ends)]])
-        return rows, torch.searchsorted(ends, chosen)
+_OF_SOURCES = Purpose.SOURCE_SUBSET, Purpose.SOURCE_AGAIN
+_OF_TARGETS = Purpose.TARGET_SUBSET, Purpose.TARGET_AGAIN
 
 
-_NO_EDGES = torch.empty((0, 2), dtype=torch.int64)
+def _counts(meshes: Tensor, counts: Counts | None) -> Tensor:
+    """Vertices [b, 1] of each mesh, on its device."""
+    return sent(torch.tensor(counts or (meshes.shape[1],) * len(meshes))[:, None], meshes.device)
 
 
-def _counts(batch: Batch) -> Counts:
-    return batch.source_counts or (batch.source.shape[1],) * len(batch.source)
+def _inside(counts: Tensor, rows: int) -> Tensor:
+    """Which of so many rows [b, rows] are those of a mesh, and not after its count [b, 1]."""
+    return torch.arange(rows, device=counts.device) < counts
 
 
 def _taken(vertices: Tensor, rows: Tensor) -> Tensor:
     return vertices.gather(1, rows[..., None].expand(-1, -1, 3))
 
 
-def _drawn(count: int, size: int, random: torch.Generator, areas: Tensor | None = None) -> Tensor:
-    """So many numbers below ``count``, none twice where there are enough: by the areas [n] around them, or alike.
+def _drawn(
+    random: RowRandom,
+    purposes: tuple[Purpose, Purpose],
+    counts: Tensor,
+    rows: int,
+    size: int,
+    *,
+    areas: Tensor | None,
+    always: Tensor | None = None,
+) -> Tensor:
+    """Numbers [b, size] of vertices, none twice where a mesh has enough: by the areas [b, rows] around them, or alike.
 
-    Where there are not, all are taken, whatever the areas.
+    Where it has fewer than ``size``, all are taken, whatever the areas, and some again. ``always`` [b, m] are taken in
+    any case.
     """
-    if areas is not None and count > size:
-        return torch.multinomial(areas[:count].clamp_min(1e-12), size, generator=random)
-    order = torch.randperm(count, generator=random, device=random.device)
-    more = torch.randint(count, (max(0, size - count),), generator=random, device=random.device)
-    return torch.cat([order[:size], more])
+    keys = random.uniform(purposes[0], rows)
+    if areas is not None:
+        keys = -(1 - keys).log() / areas.clamp_min(1e-12)  # the first to come, where an area says how often they come
+    if always is not None and always.shape[1]:
+        keys = torch.where(torch.zeros_like(keys).scatter(1, always, 1.0) > 0, -1 - keys, keys)
+    keys = keys.masked_fill(~_inside(counts, rows), np.inf)
+    first = keys.topk(min(rows, size), largest=False).indices
+    again = random.below(purposes[1], counts[:, 0], size)
+    return torch.where(_inside(counts, size), pad(first, (0, max(0, size - rows))), again)
 
 
-def _edges_of(batch: Batch, row: int) -> Tensor:
-    """Edges [e, 2] of one of the targets, by its own vertices."""
-    if isinstance(batch.edges, PackedEdges):
-        return batch.edges.part(row, row + 1, rows=batch.target.shape[1]).pairs
-    return batch.edges
+def _edges_drawn(batch: Batch, count: int, random: RowRandom) -> Tensor:
+    """So many edges [b, e, 2] of each target, by its own vertices; one may be drawn twice."""
+    edges, rows = batch.edges, batch.target.shape[1]
+    if not isinstance(edges, PackedEdges):
+        return edges[random.below(Purpose.EDGES, len(edges), count)]
+    meshes = torch.arange(len(batch), device=edges.meshes.device)
+    first, end = (torch.searchsorted(edges.meshes, meshes, right=right) for right in (False, True))
+    numbers = first[:, None] + random.below(Purpose.EDGES, end - first, count)
+    return edges.pairs[numbers] - rows * meshes[:, None, None]
 
 
-def _some_of_the_source(batch: Batch, fraction: float, random: Sequence[torch.Generator]) -> Batch:
+def _among(target: Tensor, counts: Tensor, ends: Tensor, rows: int) -> PackedEdges:
+    """Edges [b, e, 2] by their places among the vertices [b, size] that were taken of targets of up to ``rows``."""
+    size, meshes = target.shape[1], torch.arange(len(target), device=target.device)[:, None]
+    of_its_own = torch.where(_inside(counts, size), target, rows)  # what is taken again is at its first place
+    places = torch.arange(size, device=target.device).expand_as(target)
+    place = target.new_zeros((len(target), rows + 1)).scatter(1, of_its_own, places)
+    pairs = place.gather(1, ends.flatten(1)) + size * meshes
+    return PackedEdges(pairs.view(-1, 2), meshes.expand(-1, ends.shape[1]).flatten())
+
+
+def _some_of_the_source(batch: Batch, fraction: float, random: RowRandom) -> Batch:
     """A random subset of each source, in its own order."""
-    rows = []
-    for mesh, count, own in zip(batch.source, _counts(batch), random, strict=True):
-        kept = max(1, round(fraction * count))
-        rows.append(torch.randperm(count, generator=own, device=mesh.device)[:kept].sort().values)
-    return _of_rows(batch, rows)
+    counts = batch.source_counts or (batch.source.shape[1],) * len(batch)
+    keys = random.uniform(Purpose.FEWER, batch.source.shape[1])
+    return _of_highest(batch, keys, [max(1, round(fraction * count)) for count in counts])
 
 
-def _of_rows(batch: Batch, rows: Sequence[Tensor]) -> Batch:
-    """Each source's vertices of these numbers, padded; ``source_rows`` stay those of the mesh in the dataset."""
-    counts = counts_of(np.array([len(own) for own in rows]))
-    numbers = torch.nn.utils.rnn.pad_sequence(list(rows), batch_first=True)
-    there = torch.arange(numbers.shape[1], device=numbers.device) < torch.tensor([len(own) for own in rows])[
-        :, None
-    ].to(numbers.device)
-    source = _taken(batch.source, numbers) * there[..., None]
-    before = batch.source_rows
-    return replace(
-        batch,
-        source=source,
-        source_counts=counts,
-        source_rows=numbers if before is None else before.gather(1, numbers) * there,
-    )
-
-
-def _cut(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
+def _cut(batch: Batch, most: float, random: RowRandom) -> Batch:
     """Each source without what lies about one of its vertices, boxed by what is left."""
-    device = batch.source.device
-    shares = (most * torch.stack([torch.rand((), generator=own, device=device) for own in random]) ** 3).tolist()
-    rows = []
-    for mesh, count, share, own in zip(batch.source, _counts(batch), shares, random, strict=True):
-        middle = mesh[torch.randint(count, (1,), generator=own, device=device)]
-        far = (mesh[:count] - middle).square().sum(dim=1).argsort(descending=True)
-        rows.append(far[: max(1, round(count * (1 - share)))].sort().values)
-    batch = _of_rows(batch, rows)
+    counts = batch.source_counts or (batch.source.shape[1],) * len(batch)
+    shares = (most * random.on_host().uniform(Purpose.HOLE) ** 3).tolist()
+    kept = [max(1, round(count * (1 - share))) for count, share in zip(counts, shares, strict=True)]
+    middle = random.below(Purpose.HOLE_MIDDLE, _counts(batch.source, batch.source_counts)[:, 0], 1)
+    away = (batch.source - _taken(batch.source, middle)).square().sum(dim=2)
+    batch = _of_highest(batch, away, kept)
     return replace(batch, source=_boxed(batch.source, batch.source_counts))
 
 
-def _without_some_surfaces(batch: Batch, random: Sequence[torch.Generator]) -> Batch:
+def _of_highest(batch: Batch, keys: Tensor, kept: Sequence[int]) -> Batch:
+    """So many vertices of each source, of the highest keys [b, n], in their own order, padded.
+
+    ``source_rows`` stay those of the mesh in the dataset.
+    """
+    count, before = keys.shape[1], batch.source_rows
+    there = _inside(_counts(batch.source, batch.source_counts), count)
+    numbers, of_kept = torch.arange(count, device=keys.device), _counts(batch.source, tuple(kept))
+    order = torch.where(there, keys, -1).argsort(dim=1, descending=True, stable=True)
+    is_kept = torch.zeros_like(there).scatter(1, order, _inside(of_kept, count))
+    place = torch.where(is_kept, is_kept.cumsum(1) - 1, max(kept))  # the others' is cut off
+    rows = order.new_zeros((len(batch), max(kept) + 1)).scatter(1, place, numbers.expand_as(place))[:, :-1]
+    inside = _inside(of_kept, max(kept))
+    return replace(
+        batch,
+        source=_taken(batch.source, rows) * inside[..., None],
+        source_counts=counts_of(np.array(kept)),
+        source_rows=rows if before is None else before.gather(1, rows) * inside,
+    )
+
+
+def _without_some_surfaces(batch: Batch, random: RowRandom) -> Batch:
     """A quarter of the sources, by chance, as points are: it is not told what is near along their surfaces."""
     assert batch.surfaces is not None
     source, target = batch.surfaces
-    unknown = torch.stack([torch.rand((), generator=own, device=batch.source.device) < 0.25 for own in random])
+    unknown = random.uniform(Purpose.UNTOLD) < 0.25
     return replace(batch, surfaces=(source._replace(near=source.near | unknown[:, None, None]), target))
 
 
-def _noisy(batch: Batch, most: float, random: Sequence[torch.Generator]) -> Batch:
-    source = batch.source.clone()
-    for mesh, count, own in zip(source, _counts(batch), random, strict=True):
-        deviation = most * torch.rand((), generator=own, device=mesh.device).square()
-        mesh[:count] += deviation * torch.randn((count, 3), generator=own, device=mesh.device)
-    return replace(batch, source=source)
+def _noisy(batch: Batch, most: float, random: RowRandom) -> Batch:
+    deviation = most * random.uniform(Purpose.DEVIATION).square()
+    noise = deviation[:, None, None] * random.normal(Purpose.NOISE, *batch.source.shape[1:])
+    if batch.source_counts:
+        noise = noise * _inside(_counts(batch.source, batch.source_counts), batch.source.shape[1])[..., None]
+    return replace(batch, source=batch.source + noise)
 
 
-def _turned(batch: Batch, most: float, lean: float, random: Sequence[torch.Generator]) -> Batch:
+def _turned(batch: Batch, most: float, lean: float, random: RowRandom) -> Batch:
     """Source and target each turned about the vertical, then tilted, the truth as the source; in their new boxes."""
-    device = batch.source.device
-    angles = torch.stack([torch.rand(2, generator=own, device=device) for own in random]) * 2 - 1
-    turns = about_vertical(torch.cos(most * angles), torch.sin(most * angles))
+    angles = most * (random.uniform(Purpose.TURN, 2) * 2 - 1)
+    turns = about_vertical(torch.cos(angles), torch.sin(angles))
     if lean:
-        side, amount = torch.stack([torch.rand((2, 2), generator=own, device=device) for own in random]).unbind(2)
+        side, amount = random.uniform(Purpose.LEAN, 2, 2).unbind(2)
         towards = torch.stack([(2 * np.pi * side).cos(), torch.zeros_like(side), (2 * np.pi * side).sin()], dim=2)
         tilts = turned_about((lean * amount.square()[..., None] * towards).flatten(0, 1))
         turns = tilts.view_as(turns) @ turns
@@ -250,10 +249,8 @@ def _boxed(meshes: Tensor, counts: Counts | None) -> Tensor:
     """Meshes [b, n, 3] in their own boxes; rows after a mesh' count stay zero."""
     if counts is None:
         return boxed(meshes)
-    out = torch.zeros_like(meshes)
-    for row, count in enumerate(counts):
-        out[row, :count] = _boxed(meshes[row : row + 1, :count], None)[0]
-    return out
+    inside = _inside(_counts(meshes, counts), meshes.shape[1])[..., None]
+    return boxed(torch.where(inside, meshes, meshes[:, :1])) * inside
 
 
 class Shuffle:
@@ -281,13 +278,10 @@ class Shuffle:
 
 
 def _order(seed: int, step: int, count: int) -> Tensor:
-    random = _generator(seed, step, _SHUFFLED - count, torch.device("cpu"))
-    return torch.randperm(count, generator=random)
+    state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step, _SHUFFLED - count)).generate_state(
+        1, np.uint64
+    )
+    return torch.randperm(count, generator=torch.Generator().manual_seed(int(state[0])))
 
 
 _SHUFFLED = 2**63  # less a vertex count: no place of a triple in a batch
-
-
-def _generator(seed: int, step: int, place: int, device: torch.device) -> torch.Generator:
-    state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step, place)).generate_state(1, np.uint64)
-    return torch.Generator(device).manual_seed(int(state[0]))

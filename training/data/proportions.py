@@ -1,6 +1,6 @@
 """Bodies of other proportions than a dataset's, made from what its rigs say: larger heads, shorter legs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields, replace
 
 import torch
@@ -8,13 +8,12 @@ from torch import Tensor
 
 from datagen.characters.joint_names import pairs
 from training.data.batch import Batch
+from training.data.row_random import Purpose, RowRandom
 from training.networks.layers.rigid_parts import ancestors, box, moved_joints, skinned
 from training.objectives.parts import Posed
 
 
-def of_other_proportions(
-    batch: Batch, deviation: float, joints: Mapping[str, str | None], random: Sequence[torch.Generator]
-) -> Batch:
+def of_other_proportions(batch: Batch, deviation: float, joints: Mapping[str, str | None], random: RowRandom) -> Batch:
     """Half of the triples, by chance, with parts that are larger and smaller, left and right alike, posed by skinning.
 
     Parameters
@@ -32,8 +31,8 @@ def of_other_proportions(
     alike = torch.arange(len(names), device=device)
     for left, right in pairs(names):
         alike[right] = left
-    drawn = torch.stack([torch.randn((2, len(names)), generator=own, device=device) for own in random])
-    chosen = torch.stack([torch.rand((), generator=own, device=device) < 0.5 for own in random])
+    drawn = random.normal(Purpose.PROPORTIONS, 2, len(names))
+    chosen = random.uniform(Purpose.RESIZED) < 0.5
     sizes = torch.exp(deviation * drawn[:, :, alike]).to(batch.source.dtype)
     bodies = [
         _resized(posed, factors, tree, above) for posed, factors in zip(batch.posed, sizes.unbind(1), strict=True)

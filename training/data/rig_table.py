@@ -16,14 +16,18 @@ from datagen.mesh.geometry import edges_of
 from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
 from datagen.store import Dataset
 from training.data.batch import Batch
+from training.data.row_random import Purpose, RowRandom
 from training.data.surface_points import SurfacePoints, Triangles, points_of
 from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers import rigid_parts
 from training.networks.layers.rigid_parts import ancestors, moved_joints
+from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.parts import Posed
 
+_OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
+_OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
 _POSES = 8  # of an identity, that its body at rest is found from
 
 
@@ -82,7 +86,12 @@ class RigTable:
             rest.append(torch.from_numpy(its_rest).to(device))
             at.append(its_joints)
             self._row[int(identity)] = len(rest) - 1
-        self._weights, self._rest, self._kinds, self._triangles = weights, rest, kinds, triangles
+        self._kinds, self._triangles = kinds, triangles
+        self._weights, self._rest = torch.cat(weights), torch.cat(rest)
+        self._areas = torch.cat([its.areas for its in triangles])
+        self._of_weights = np.cumsum([0, *map(len, weights[:-1])])[kinds]
+        self._of_rest = np.cumsum([0, *map(len, rest[:-1])])
+        self._counts = np.array([len(its) for its in rest])
         self._surfaces = joined(surfaces).to(device)
         self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
         self._joints = torch.from_numpy(np.stack(at)).to(device)
@@ -98,23 +107,48 @@ class RigTable:
         )
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
-    def areas(self, identity: int) -> Tensor:
-        """What share of the area at rest lies around each vertex [v] of the first identity with this one's weights."""
-        return self._triangles[self._kinds[self._row[identity]]].areas
+    def areas(self, triples: Triples, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
+        """By what share of the area at rest lies around them vertices [b, n] of sources and of targets are to be drawn.
 
-    def of_points(self, triples: Triples, batch: Batch, chance: float, random: Sequence[torch.Generator]) -> Batch:
+        That of the first identity with the same weights. Meshes of no more vertices than a network samples are drawn
+        from alike, as of others it leaves out most in faces and hands, too; so are points, which lie evenly. None: all.
+        """
+        source, target = batch.points or (None, None)
+        return (
+            self._areas_of(triples[:, 0], batch.source, batch.source_rows, source),
+            self._areas_of(triples[:, 2], batch.target, batch.target_rows, target),
+        )
+
+    def _areas_of(
+        self, identities: NDArray[np.integer], vertices: Tensor, rows: Tensor | None, points: SurfacePoints | None
+    ) -> Tensor | None:
+        own = self._rows(identities)
+        dense = (self._counts[own] > MOST_SAMPLED) & ~np.array(points.drawn if points else [False] * len(own))
+        if not dense.any():
+            return None
+        about = np.stack([self._of_weights[own], self._counts[own] - 1, dense])
+        first, last, by_area = sent(torch.from_numpy(about), self._device)[..., None].unbind(0)
+        rows = torch.arange(vertices.shape[1], device=self._device).minimum(last) if rows is None else rows
+        areas = self._areas.index_select(0, (rows + first).flatten()).view(rows.shape)
+        return torch.where(by_area > 0, areas, 1.0)
+
+    def _rows(self, identities: NDArray[np.integer]) -> NDArray[np.int64]:
+        return np.array([self._row[int(identity)] for identity in identities])
+
+    def of_points(self, triples: Triples, batch: Batch, chance: float, random: RowRandom) -> Batch:
         """The batch, each source and each target (with its truth) with this chance as points of its surface."""
         drawn = [
             points_of(
-                [self._triangles[self._kinds[self._row[int(identity)]]] for identity in identities],
+                [self._triangles[self._kinds[row]] for row in self._rows(identities)],
                 counts or (meshes.shape[1],) * len(meshes),
                 meshes.shape[1],
                 chance,
                 random,
+                purposes,
             )
-            for identities, meshes, counts in (
-                (triples[:, 0], batch.source, batch.source_counts),
-                (triples[:, 2], batch.target, batch.target_counts),
+            for identities, meshes, counts, purposes in (
+                (triples[:, 0], batch.source, batch.source_counts, _OF_SOURCES),
+                (triples[:, 2], batch.target, batch.target_counts, _OF_TARGETS),
             )
         ]
         source, target = drawn
@@ -134,7 +168,7 @@ class RigTable:
         points: SurfacePoints | None,
     ) -> Surface:
         """The surfaces of meshes of these identities; a pose does not change what is near along them."""
-        kinds = sent(torch.tensor([self._kinds[self._row[int(identity)]] for identity in identities]), self._device)
+        kinds = sent(torch.tensor([self._kinds[row] for row in self._rows(identities)]), self._device)
         cells, near = (each.index_select(0, kinds) for each in self._surfaces)
         if points is not None:
             cells = cells.gather(1, points.corners[..., 0])
@@ -159,25 +193,24 @@ class RigTable:
         points
             Of the meshes, where they are made of some in the place of vertices.
         """
-        own = [self._row[int(identity)] for identity in identities]
-        rows = torch.arange(vertices.shape[1]).expand(len(own), -1) if rows is None else rows
-        turns = self._world.index_select(0, sent(torch.from_numpy(np.asarray(poses, np.int64)), self._device))
-        numbers = sent(torch.tensor(own), self._device)
+        own = self._rows(identities)
+        about = np.stack([own, self._of_weights[own], self._of_rest[own], self._counts[own] - 1, poses])
+        numbers, of_weights, of_rest, last, pose = sent(torch.from_numpy(about), self._device).unbind(0)
+        if rows is None:
+            rows = torch.arange(vertices.shape[1], device=self._device).minimum(last[:, None])
+        if points is not None:
+            points = points.at(rows) if any(points.drawn) else None
+        used = rows if points is None else points.corners.flatten(1)
+        turns = self._world.index_select(0, pose)
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
-
-        def at(mesh: int, kept: Tensor) -> tuple[Tensor, ...]:
-            """Weights, rest positions and posed positions of vertices of one mesh, or of points of its triangles."""
-            drawn = points if points is not None and points.drawn[mesh] else None
-            used = kept if drawn is None else drawn.corners[mesh, kept].flatten()
-            weights, rest = self._weights[self._kinds[own[mesh]]][used], self._rest[own[mesh]][used]
-            body = (rest, weights, turns[mesh], joints[mesh], moved[mesh])
-            found = weights, rest, rigid_parts.skinned(*(each[None] for each in body))[0]
-            if drawn is None:
-                return found
-            return tuple(drawn.mixed(mesh, each.view(len(kept), 3, -1), kept) for each in found)
-
-        weights, rest, posed = (torch.stack(each) for each in zip(*map(at, range(len(own)), rows), strict=True))
+        weights, rest = (
+            table.index_select(0, (used + first[:, None]).flatten()).view(*used.shape, -1)
+            for table, first in ((self._weights, of_weights), (self._rest, of_rest))
+        )
+        posed = rigid_parts.skinned(rest, weights, turns, joints, moved)
+        if points is not None:
+            weights, rest, posed = (points.mixed(each) for each in (weights, rest, posed))
         return Posed(weights, rest, joints, *_carried(posed, vertices, turns, moved), present)
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

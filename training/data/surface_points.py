@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.common.arrays import Floats
-
-_ALL = slice(None)
+from training.data.row_random import Purpose, RowRandom
+from training.networks.execution import sent
 
 
 class SurfacePoints(NamedTuple):
@@ -36,16 +37,26 @@ class SurfacePoints(NamedTuple):
         """The same on another device."""
         return SurfacePoints(self.corners.to(device), self.shares.to(device), self.drawn)
 
-    def of(self, values: Tensor) -> Tensor:
-        """Return values [b, n, c] at the points, from those at as many vertices of each mesh [b, n, c]."""
-        found = values.clone()
-        for mesh in np.flatnonzero(self.drawn).tolist():
-            found[mesh] = self.mixed(mesh, values[mesh, self.corners[mesh]])
-        return found
+    def at(self, rows: Tensor) -> SurfacePoints:
+        """Those of the points of these numbers [b, k] alone."""
+        some = rows[..., None].expand(-1, -1, 3)
+        return SurfacePoints(self.corners.gather(1, some), self.shares.gather(1, some), self.drawn)
 
-    def mixed(self, mesh: int, values: Tensor, rows: Tensor | slice = _ALL) -> Tensor:
-        """Return values [k, c] at points [k] of one mesh, by number, from those at their corners [k, 3, c]."""
-        return (values * self.shares[mesh, rows, :, None].to(values.dtype)).sum(dim=1)
+    def of(self, values: Tensor) -> Tensor:
+        """Return values [b, n, c] at the points, from those at the vertices of each mesh [b, n, c]."""
+        rows = sent(torch.from_numpy(np.flatnonzero(self.drawn)), values.device)
+        corners = self.corners.index_select(0, rows).flatten(1)[..., None].expand(-1, -1, values.shape[2])
+        found = _mixed(values.index_select(0, rows).gather(1, corners), self.shares.index_select(0, rows))
+        return values.index_copy(0, rows, found)
+
+    def mixed(self, values: Tensor) -> Tensor:
+        """Return values [b, n, c] at the points, from those at their corners [b, 3 n, c]."""
+        return _mixed(values, self.shares)
+
+
+def _mixed(values: Tensor, shares: Tensor) -> Tensor:
+    of_each = values.view(*shares.shape, values.shape[2])
+    return (of_each * shares[..., None].to(values.dtype)).sum(dim=2)
 
 
 class Triangles:
@@ -72,17 +83,22 @@ class Triangles:
         self.areas = torch.from_numpy(around / around.sum()).float().to(device)
         self._below = torch.from_numpy(np.cumsum(areas / areas.sum())).float().to(device)
 
-    def drawn(self, count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Corners and shares [count, 3] of points of the surface, even by area."""
-        at, one, two = torch.rand((3, count), generator=random, device=self._below.device)
-        face = torch.searchsorted(self._below, at).clamp_max(len(self._faces) - 1)
+    def drawn(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners and shares [b, n, 3] of points of the surface, even by area, for numbers [b, n, 3] in [0, 1)."""
+        at, one, two = numbers.unbind(2)
+        face = torch.searchsorted(self._below, at.contiguous()).clamp_max(len(self._faces) - 1)
         root = one.sqrt()
-        shares, order = torch.stack([1 - root, root * (1 - two), root * two], dim=1).sort(dim=1, descending=True)
-        return self._faces[face].gather(1, order), shares
+        shares, order = torch.stack([1 - root, root * (1 - two), root * two], dim=2).sort(dim=2, descending=True)
+        return self._faces[face].gather(2, order), shares
 
 
 def points_of(
-    meshes: Sequence[Triangles], counts: Sequence[int], rows: int, chance: float, random: Sequence[torch.Generator]
+    meshes: Sequence[Triangles],
+    counts: Sequence[int],
+    rows: int,
+    chance: float,
+    random: RowRandom,
+    purposes: tuple[Purpose, Purpose],
 ) -> SurfacePoints:
     """Draw as many points of each mesh as it has vertices, with this chance; else its vertices stay as they are.
 
@@ -94,12 +110,19 @@ def points_of(
         Vertices of each mesh.
     rows
         To which they are padded; rows after a mesh' count stay what they are.
+    random, purposes
+        By which meshes, and their points, are drawn.
     """
-    device = random[0].device
+    device = random.device
     corners = torch.arange(rows, device=device)[None, :, None].repeat(len(meshes), 1, 3)
-    shares = torch.tensor([1.0, 0.0, 0.0], device=device).repeat(len(meshes), rows, 1)
-    chosen = (torch.stack([torch.rand((), generator=own, device=device) for own in random]) < chance).tolist()
-    for row, (triangles, count, own) in enumerate(zip(meshes, counts, random, strict=True)):
+    shares = torch.tensor([1.0, 0.0, 0.0]).to(device).repeat(len(meshes), rows, 1)
+    chosen = (random.on_host().uniform(purposes[0]) < chance).tolist()
+    alike = defaultdict[tuple[Triangles, int], list[int]](list)
+    for row, kind in enumerate(zip(meshes, counts, strict=True)):
         if chosen[row]:
-            corners[row, :count], shares[row, :count] = triangles.drawn(count, own)
+            alike[kind].append(row)
+    for (triangles, count), numbers in alike.items():
+        those = torch.tensor(numbers)
+        its, own = sent(those, device), random.of(those)
+        corners[its, :count], shares[its, :count] = triangles.drawn(own.uniform(purposes[1], count, 3))
     return SurfacePoints(corners, shares, tuple(chosen))

@@ -116,10 +116,26 @@ def avatar_loss(
 def nearest(queries: Tensor, points: Tensor) -> Tensor:
     """Return the number [q] of the point among ``[n, 3]`` that is nearest to each of ``[q, 3]``.
 
-    By k-d trees on the CPU: it takes n log n time, and no gradient. What is not finite is taken to lie at the origin.
+    By a k-d tree, which takes n log n time on a CPU; on a GPU by all distances, which it has sooner than it could ask.
+    There is no gradient. What is not finite is taken to lie at the origin.
     """
-    asked, there = (np.nan_to_num(tensor.detach().cpu().numpy(), posinf=0, neginf=0) for tensor in (queries, points))
-    return torch.from_numpy(cKDTree(there).query(asked)[1]).to(queries.device)
+    asked, there = (tensor.detach().nan_to_num(posinf=0, neginf=0) for tensor in (queries, points))
+    if not asked.is_cuda:
+        return torch.from_numpy(cKDTree(there.numpy()).query(asked.numpy())[1])
+    some = asked.split(max(1, _DISTANCES // len(there)))  # type: ignore[no-untyped-call]
+    return torch.cat([squared_distances(each, there).argmin(dim=1) for each in some])
+
+
+_DISTANCES = 2**27
+"""That are kept at a time."""
+
+
+def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
+    """Return [q, n] for ``[q, 3]`` and ``[n, 3]``, by differences: of near points products would leave rounding."""
+    found = (queries[:, None, 0] - points[:, 0]).square_()
+    for axis in (1, 2):
+        found += (queries[:, None, axis] - points[:, axis]).square_()
+    return found
 
 
 def _distances(points: Tensor, normals: Tensor, scan: Scan) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,5 +1,6 @@
 """Batches: the right meshes, edges of one topology or many, and augmentation that depends on nothing but its place."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -232,16 +233,45 @@ def test_a_step_takes_so_many_vertices_and_edges_between_them(mixed: Dataset) ->
 def test_a_mesh_of_fewer_vertices_gives_some_twice_and_the_parts_network_gets_no_edges(mixed: Dataset) -> None:
     (batch,) = augmented(mixed, step=2, subset=40)
     assert batch.target.shape == (8, 40, 3) and batch.source_rows is not None
-    assert all(len(rows.unique()) in MIXED_COUNTS for rows in batch.source_rows)
     (whole,) = augmented(mixed, step=2)
     assert isinstance(batch.edges, PackedEdges) and isinstance(whole.edges, PackedEdges)
-    assert batch.target_rows is not None
+    assert batch.target_rows is not None and whole.source_counts and whole.target_counts
+    for meshes, of_whole, its_rows, counts in (
+        (batch.source, whole.source, batch.source_rows, whole.source_counts),
+        (batch.target, whole.target, batch.target_rows, whole.target_counts),
+        (batch.truth, whole.truth, batch.target_rows, whole.target_counts),
+    ):
+        for mesh, before, rows, count in zip(meshes, of_whole, its_rows, counts, strict=True):
+            assert torch.equal(mesh, before[rows]) and set(rows.tolist()) == set(range(count)), "all, and no others"
     for mesh, rows in enumerate(batch.target_rows):
         own = batch.edges.part(mesh, mesh + 1, rows=40).pairs
-        assert torch.equal(rows[own], whole.edges.part(mesh, mesh + 1, rows=whole.target.shape[1]).pairs)
+        known = whole.edges.part(mesh, mesh + 1, rows=whole.target.shape[1]).pairs
+        assert len(own) == 10 and own.min() >= 0 and own.max() < 40
+        assert {tuple(pair) for pair in rows[own].tolist()} <= {tuple(pair) for pair in known.tolist()}
     plain = open_bank(mixed, mixed.identities("training")).batch(TRIPLES)
     thinned = Augmentation(tiny_training(**PARTS))(TRIPLES, plain, step=0, first=0)
     assert isinstance(thinned.edges, PackedEdges) and len(thinned.edges.pairs) == 0
+
+
+@pytest.mark.parametrize("subset", [20, 40])
+@pytest.mark.parametrize("triples", [TRIPLES, np.array([[0, 1, 1, 2], [1, 3, 4, 0]])], ids=["many", "one"])
+def test_every_edge_of_a_mesh_is_drawn_about_as_often(mixed: Dataset, triples: np.ndarray, subset: int) -> None:
+    """Whether targets are of many topologies, or of one."""
+    whole = open_bank(mixed, mixed.identities("training")).batch(triples)
+    assert isinstance(whole.edges, PackedEdges) == (len(triples) > 2)
+    augment = Augmentation(tiny_training(augmentation={"subset": subset}))
+    found = [Counter[tuple[int, int]]() for _ in triples]
+    for step in range(400):
+        batch = augment(triples, whole, step=step, first=0)
+        assert isinstance(batch.edges, PackedEdges) and batch.target_rows is not None
+        for mesh, rows in enumerate(batch.target_rows):
+            own = batch.edges.part(mesh, mesh + 1, rows=subset).pairs
+            found[mesh].update((first, second) for first, second in rows[own].tolist())
+    for counts, target in zip(found, triples[:, 2].tolist(), strict=True):
+        edges = [(first, second) for first, second in edges_of(mixed.faces(target)).tolist()]
+        mean = 400 * (subset // 4) / len(edges)
+        assert sorted(counts) == sorted(edges)
+        assert sum((counts[edge] - mean) ** 2 / mean for edge in edges) == pytest.approx(len(edges), rel=0.6)
 
 
 def test_meshes_are_turned_about_the_vertical_and_boxed_anew(mixed: Dataset) -> None:

@@ -12,6 +12,7 @@ from training.data.augmentation import Augmentation
 from training.data.batch import Batch
 from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
+from training.data.row_random import RowRandom
 from training.data.vertex_bank import open_bank
 from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
 
@@ -31,8 +32,11 @@ def told(legs: Dataset) -> Batch:
 
 
 def resized(told: Batch, deviation: float = 0.3) -> Batch:
-    random = [torch.Generator().manual_seed(row) for row in range(len(told))]
-    return of_other_proportions(told, deviation, LEG, random)
+    return of_other_proportions(told, deviation, LEG, random_of(told))
+
+
+def random_of(batch: Batch) -> RowRandom:
+    return RowRandom(0, 0, first=0, rows=len(batch), device="cpu")
 
 
 def test_half_of_the_triples_change_and_the_others_are_left_as_they_are(told: Batch) -> None:
@@ -114,7 +118,7 @@ def test_left_and_right_are_alike(legs: Dataset) -> None:
     assert told.posed is not None
     mirrored = told.posed[0].rest_joints * 0 + torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     told = replace(told, posed=tuple(replace(each, rest_joints=mirrored) for each in told.posed))
-    batch = of_other_proportions(told, 0.3, both, [torch.Generator().manual_seed(row) for row in range(len(told))])
+    batch = of_other_proportions(told, 0.3, both, random_of(told))
     assert batch.posed is not None
     names = list(both)
     knees = [names.index(f"{side}_knee") for side in ("left", "right")]

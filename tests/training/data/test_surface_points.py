@@ -5,13 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
+from datagen.common.arrays import Floats
 from datagen.generate import generate
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import LEG, PARTS, mixed_dataset, tiny_training
+from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation import Augmentation
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
+from training.data.row_random import Purpose, RowRandom
 from training.data.surface_points import Triangles, points_of
 from training.data.vertex_bank import open_bank
 from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
@@ -22,8 +25,11 @@ CORNERS = np.array([[0.0, 0, 0], [3, 0, 0], [0, 2, 0], [-1, 0, 0]])  # areas 3 a
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def random(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+PURPOSES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
+
+
+def random(step: int, *, rows: int) -> RowRandom:
+    return RowRandom(0, step, first=0, rows=rows, device=CPU)
 
 
 @pytest.fixture
@@ -50,7 +56,8 @@ def augmented(legs: Dataset, **changes: float) -> Batch:
 def test_points_are_even_by_area() -> None:
     triangles = Triangles(CORNERS, FACES, device=CPU)
     np.testing.assert_allclose(triangles.areas, [1 / 3, 1 / 4, 1 / 3, 1 / 12], atol=1e-6)
-    corners, shares = triangles.drawn(20_000, random(0))
+    numbers = random(0, rows=2).uniform(Purpose.SOURCE_POINTS, 10_000, 3)
+    corners, shares = (each.flatten(0, 1) for each in triangles.drawn(numbers))
     assert (shares >= 0).all() and torch.allclose(shares.sum(dim=1), torch.ones(20_000))
     assert (shares.diff(dim=1) <= 0).all(), "the largest share first"
     at = (torch.from_numpy(CORNERS).float()[corners] * shares[..., None]).sum(dim=1).numpy()
@@ -62,20 +69,44 @@ def test_points_are_even_by_area() -> None:
 
 def test_values_are_mixed_by_shares_and_padding_stays() -> None:
     triangles = Triangles(CORNERS, FACES, device=CPU)
-    points = points_of([triangles, triangles], (4, 3), 6, 1.0, [random(1), random(2)])
-    vertices = torch.randn((2, 6, 3), generator=random(3))
-    for found in (
-        points.of(vertices),
-        torch.stack([points.mixed(mesh, vertices[mesh, points.corners[mesh]]) for mesh in (0, 1)]),
-    ):
+    points = points_of([triangles, triangles], (4, 3), 6, 1.0, random(1, rows=2), PURPOSES)
+    assert points.drawn == (True, True) and not torch.equal(points.shares[0, :3], points.shares[1, :3])
+    vertices = torch.randn((2, 6, 3), generator=torch.Generator().manual_seed(3))
+    at_corners = torch.stack([vertices[mesh, points.corners[mesh].flatten()] for mesh in (0, 1)])
+    for found in (points.of(vertices), points.mixed(at_corners)):
         for mesh, count in enumerate((4, 3)):
             mixed = torch.stack([vertices[mesh, own] for own in points.corners[mesh].T], dim=1)
             expected = (mixed * points.shares[mesh, :, :, None]).sum(dim=1)
             torch.testing.assert_close(found[mesh], expected)
             assert torch.equal(found[mesh, count:], vertices[mesh, count:])
             assert not torch.isclose(found[mesh, :count], vertices[mesh, :count]).all(dim=1).any()
-    untouched = points_of([triangles, triangles], (4, 3), 6, 0.0, [random(1), random(2)])
-    assert torch.equal(untouched.of(vertices), vertices)
+    rows = torch.tensor([[5, 0, 2, 0], [1, 1, 4, 2]])
+    some = points.at(rows).mixed(
+        torch.stack([at_corners[mesh].view(6, 3, 3)[rows[mesh]] for mesh in (0, 1)]).flatten(1, 2)
+    )
+    assert torch.equal(some, torch.stack([points.of(vertices)[mesh, rows[mesh]] for mesh in (0, 1)]))
+    untouched = points_of([triangles, triangles], (4, 3), 6, 0.0, random(1, rows=2), PURPOSES)
+    assert torch.equal(untouched.of(vertices), vertices) and untouched.drawn == (False, False)
+
+
+def test_of_several_surfaces_each_mesh_has_points_of_its_own(legs: Dataset) -> None:
+    """Meshes of which some are drawn, in any order of topologies and counts, have what each would have alone."""
+    square, line = Triangles(CORNERS, FACES, device=CPU), Triangles(CORNERS, FACES[:1], device=CPU)
+    meshes, counts = [line, square, line, square, square, line], (3, 4, 5, 4, 3, 3)
+    vertices = torch.randn((6, 5, 3), generator=torch.Generator().manual_seed(3))
+    seen = set[tuple[bool, ...]]()
+    for step in range(8):
+        together = random(step, rows=6)
+        points = points_of(meshes, counts, 5, 0.5, together, PURPOSES)
+        seen.add(points.drawn)
+        for row, (mesh, count) in enumerate(zip(meshes, counts, strict=True)):
+            alone = RowRandom(0, step, first=row, rows=1, device=CPU)
+            its = points_of([mesh], [count], 5, 0.5, alone, PURPOSES)
+            assert its.drawn == points.drawn[row : row + 1]
+            assert torch.equal(its.corners[0], points.corners[row]) and torch.equal(its.shares[0], points.shares[row])
+            assert torch.equal(its.of(vertices[row : row + 1])[0], points.of(vertices)[row])
+            assert torch.equal(points.of(vertices)[row], vertices[row]) != points.drawn[row]
+    assert len(seen) > 4
 
 
 def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
@@ -93,15 +124,15 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
             whole, points = torch.from_numpy(legs.vertices(identity, pose)), batch.points[min(side, 1)]
             low, high = whole.aminmax(dim=0)
             boxed = (whole - (low + high) / 2) / ((high - low).max() / 2)
-            corners = points.corners[row, rows[row]]
-            expected = points.mixed(row, boxed[corners], rows[row])
+            corners, shares = (each[row, rows[row]] for each in (points.corners, points.shares[..., None]))
+            expected = (boxed[corners] * shares).sum(dim=1)
             torch.testing.assert_close(meshes[row], expected, rtol=0, atol=1e-3)
             if side < 2:
                 rig = legs.rig(identity)
                 assert rig is not None
                 cells = surface_of_topology(legs, identity)[points.corners[row, rows[row], 0]]
                 assert torch.equal(batch.surfaces[side].cells[row], cells), "that of the nearest corner"
-                weights = points.mixed(row, torch.from_numpy(rig.weights).float()[corners], rows[row])
+                weights = (torch.from_numpy(rig.weights).float()[corners] * shares).sum(dim=1)
                 torch.testing.assert_close(batch.posed[side].weights[row], weights, rtol=0, atol=1e-5)
     for with_points, without in zip(batch.posed, plain.posed, strict=True):  # the same bodies in the same poses
         torch.testing.assert_close(with_points.rotations, without.rotations, rtol=0, atol=5e-4)
@@ -111,13 +142,17 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
 def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
     legs: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("training.data.augmentation.MOST_SAMPLED", 10)
     identities = legs.identities("training")
     rigs = RigTable(legs, identities, LEG, device="cpu")
     whole = open_bank(legs, identities).batch(TRIPLES)
+    assert rigs.areas(TRIPLES, whole) == (None, None), "of so few vertices a network samples all"
+    monkeypatch.setattr("training.data.rig_table.MOST_SAMPLED", 10)
     recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 8}})
     drawn = [Augmentation(recipe, rigs)(TRIPLES, whole, step=step, first=0) for step in range(400)]
-    areas = rigs.areas(int(TRIPLES[0, 0]))
+    of_sources, of_targets = rigs.areas(TRIPLES, whole)
+    assert of_sources is not None and of_targets is not None
+    areas = of_sources[0]
+    assert all(torch.equal(each, areas) for each in (*of_sources, *of_targets)), "they are of one topology"
     assert areas.sum() == pytest.approx(1, abs=1e-5)
     large = areas > areas.median()
     assert areas.max() > 1.2 * areas.min(), "else this would show nothing"
@@ -127,22 +162,28 @@ def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
         assert large[numbers].float().mean() == pytest.approx(float(areas[large].sum()), abs=0.03)
 
 
+@pytest.mark.parametrize("most", [30, 29])
 def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    """Of meshes of 32 and 30 vertices; all of the area lies around every fourth vertex, others for each identity."""
+    """Of meshes of 32 and 30 vertices; all of the area lies around every third vertex, others for each topology."""
+    kinds = list[Triangles]()
+
+    class Striped(Triangles):
+        def __init__(self, vertices: Floats, faces: NDArray[np.integer], *, device: torch.device) -> None:
+            super().__init__(vertices, faces, device=device)
+            self.areas = (torch.arange(len(vertices)) % 3 == len(kinds)).float()
+            kinds.append(self)
+
+    monkeypatch.setattr("training.data.rig_table.Triangles", Striped)
     mixed = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
     identities = mixed.identities("training")
     bank, rigs = open_bank(mixed, identities), RigTable(mixed, identities, LEG, device="cpu")
-    monkeypatch.setattr("training.data.augmentation.MOST_SAMPLED", 30)
-    monkeypatch.setattr(
-        RigTable,
-        "areas",
-        lambda _, identity: (torch.arange(mixed.vertex_count(identity)) % 4 == identity % 4).float(),
-    )
+    monkeypatch.setattr("training.data.rig_table.MOST_SAMPLED", most)
+    assert [len(each.areas) for each in kinds] == [*MIXED_COUNTS], "as many topologies as there are kinds of legs"
     triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [3, 2, 0, 1]])
-    dense = np.array([[mixed.vertex_count(int(own)) > 30 for own in pair] for pair in triples[:, [0, 2]]])
-    assert dense.any(axis=0).all() and not dense.all(axis=0).any()
+    dense = np.array([[mixed.vertex_count(int(own)) > most for own in pair] for pair in triples[:, [0, 2]]])
+    assert dense.any(axis=0).all() and dense.all() == (most < 30)
 
     def shares(**changes: float) -> np.ndarray:
         """Share of the drawn vertices around which the area lies, of each source and target [triple, 2]."""
@@ -151,7 +192,7 @@ def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
         for step in range(40):
             batch = Augmentation(recipe, rigs)(triples, bank.batch(triples), step=step, first=0)
             rows = torch.stack([own for own in (batch.source_rows, batch.target_rows) if own is not None], dim=1)
-            found.append(rows % 4 == torch.from_numpy(triples[:, [0, 2], None] % 4))
+            found.append(rows % 3 == torch.from_numpy(triples[:, [0, 2], None] % 3))
         return torch.stack(found).float().mean(dim=(0, 3)).numpy()
 
     plain, cut, points = shares(), shares(source_holes=0.8), shares(points=1.0)
@@ -163,12 +204,15 @@ def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
 def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
     rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
-    drawn = [rigs.of_points(TRIPLES, batch, 0.3, [random(9 * step + row) for row in range(3)]) for step in range(60)]
+    drawn = [rigs.of_points(TRIPLES, batch, 0.3, random(step, rows=3)) for step in range(60)]
     shares = [
         (each.points[side].shares[..., 0] < 1).any(dim=1).float() for each in drawn if each.points for side in (0, 1)
     ]
     assert torch.cat(shares).mean() == pytest.approx(0.3, abs=0.08)
     assert any((one != other).any() for one, other in zip(shares[::2], shares[1::2], strict=True)), "each mesh its own"
+    assert not all(share.any() for share in shares), "of some batches none"
+    said = [each.points[side].drawn for each in drawn if each.points for side in (0, 1)]
+    assert [tuple(share.bool().tolist()) for share in shares] == said
 
 
 def test_points_of_meshes_of_several_vertex_counts_are_turned_cut_and_thinned_like_vertices(
@@ -186,7 +230,9 @@ def test_points_of_meshes_of_several_vertex_counts_are_turned_cut_and_thinned_li
     halves = [
         augment(triples[at], bank.batch(triples[at]), step=5, first=at.start) for at in (slice(0, 2), slice(2, 4))
     ]
-    torch.testing.assert_close(torch.cat([each.source for each in halves]), whole.source, rtol=0, atol=1e-6)
+    for name in ("source", "target", "truth", "source_rows", "target_rows"):
+        parts = torch.cat([getattr(each, name) for each in halves])
+        torch.testing.assert_close(parts, getattr(whole, name), rtol=0, atol=1e-6)
     assert whole.posed
     for posed, meshes in zip(whole.posed, (whole.source, whole.target), strict=True):
         joints = moved_joints(posed.rest_joints, posed.rotations, torch.tensor([0, 0]), ancestors([-1, 0]))

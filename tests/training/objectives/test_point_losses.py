@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from training.networks.avatar import Avatar
-from training.objectives.point_losses import Edges, Scan, avatar_loss, nearest
+from training.objectives.point_losses import Edges, Scan, avatar_loss, nearest, squared_distances
 
 
 def some(*counts: int, seed: int = 0) -> Avatar:
@@ -71,6 +71,21 @@ def test_a_point_that_is_not_finite_gives_a_loss_that_is_not() -> None:
     avatar = some(12)
     broken = avatar._replace(points=avatar.points.detach().index_fill(0, torch.tensor([3]), torch.nan))
     assert not avatar_loss(broken, scans(9), normals=1.0)[0].isfinite()
+
+
+def test_the_nearest_of_all_distances_is_that_of_the_tree() -> None:
+    """Which is how a GPU finds it, some queries at a time."""
+    first, second = (torch.randn(count, 3, generator=torch.Generator().manual_seed(count)) for count in (50, 70))
+    assert torch.equal(squared_distances(first, second).argmin(1), nearest(first, second))
+    torch.testing.assert_close(squared_distances(first, second).sqrt(), torch.cdist(first, second))
+
+
+@pytest.mark.gpu
+def test_a_gpu_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (torch.randn(count, 3, generator=torch.Generator().manual_seed(count)) for count in (50, 70))
+    first[3] = torch.nan
+    monkeypatch.setattr("training.objectives.point_losses._DISTANCES", 200)
+    assert torch.equal(nearest(first.cuda(), second.cuda()).cpu(), nearest(first, second))
 
 
 def test_the_nearest_is_that_of_a_table() -> None:

@@ -64,21 +64,29 @@ class Muon(torch.optim.AdamW):
             each.grad = gradient
 
     def _move(self, matrices: list[nn.Parameter], gradients: list[Tensor]) -> None:
+        if not matrices:
+            return
         group, bad = self.param_groups[0], getattr(self, "found_inf", None)
-        ahead = []
-        for parameter, own in zip(matrices, gradients, strict=True):
-            state = self.state[parameter]
-            if not state:
+        for parameter in matrices:
+            if not self.state[parameter]:
                 # AdamW, whose class this is, asks every state for a step when it is loaded
-                state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
-            gradient = own if bad is None else own.masked_fill(bad > 0, 0)
-            state["momentum"].lerp_(gradient, (1 - _MOMENTUM) * (1 if bad is None else 1 - bad))
-            ahead.append(gradient.lerp(state["momentum"], _MOMENTUM).flatten(1))  # Nesterov's
-        moved = torch.tensor(1.0) if bad is None else 1 - bad
-        for parameter, step in zip(matrices, self._directions(ahead), strict=True):
-            size = group["lr"] * _SHARE_OF_ADAM * max(step.shape) ** 0.5
-            parameter.mul_(1 - moved * group["lr"] * group["weight_decay"])
-            parameter.sub_(step.view_as(parameter) * (size * moved))
+                self.state[parameter].update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
+        momenta = [self.state[parameter]["momentum"] for parameter in matrices]
+        if bad is not None:  # then it stays as it is
+            pairs = zip(momenta, gradients, strict=True)
+            gradients = [torch.where(bad > 0, momentum, gradient) for momentum, gradient in pairs]
+        torch._foreach_lerp_(momenta, gradients, 1 - _MOMENTUM)
+        ahead = torch._foreach_lerp(gradients, momenta, _MOMENTUM)  # Nesterov's
+        steps = self._directions([each.flatten(1) for each in ahead])
+        sizes: list[Any] = [group["lr"] * _SHARE_OF_ADAM * max(step.shape) ** 0.5 for step in steps]
+        torch._foreach_mul_(steps, sizes)
+        decay: Any = group["lr"] * group["weight_decay"]
+        if bad is not None:
+            torch._foreach_mul_(steps, 1 - bad)
+            decay = (1 - bad) * decay
+        own: list[Tensor] = [*matrices]
+        torch._foreach_mul_(own, 1 - decay)
+        torch._foreach_sub_(own, [step.view_as(its) for step, its in zip(steps, matrices, strict=True)])
 
     def _directions(self, matrices: Sequence[Tensor]) -> list[Tensor]:
         """The orthogonal matrix nearest to each, those of one shape together; ranks share them by their cost."""
@@ -92,13 +100,13 @@ class Muon(torch.optim.AdamW):
                 mine[matrices[number].shape].append(number)
         found = matrices[0].new_zeros(sum(map(Tensor.numel, matrices)))
         pieces = torch.split(found, [each.numel() for each in matrices])
+        steps = [piece.view_as(each) for piece, each in zip(pieces, matrices, strict=True)]
         for numbers in mine.values():
-            steps = orthogonal(torch.stack([matrices[number] for number in numbers]))
-            for number, step in zip(numbers, steps, strict=True):
-                pieces[number].copy_(step.flatten())
+            own = orthogonal(torch.stack([matrices[number] for number in numbers]))
+            torch._foreach_copy_([steps[number] for number in numbers], list(own.unbind()))
         if self._ranks > 1:
             dist.all_reduce(found)  # others have zeros there
-        return [piece.view_as(each) for piece, each in zip(pieces, matrices, strict=True)]
+        return steps
 
 
 def _cost(matrix: Tensor) -> int:

@@ -24,7 +24,7 @@ def matrices(numbers: Tensor) -> Tensor:
 
 def box(vertices: Tensor) -> tuple[Tensor, Tensor]:
     """Return the middle [b, 1, 3] and half the longest edge [b, 1, 1] of the boxes of vertices [b, n, 3]."""
-    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
+    low, high = torch.aminmax(vertices, dim=1, keepdim=True)
     return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
 
 
@@ -35,10 +35,12 @@ def about_vertical(cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def turned_about(vectors: Tensor) -> Tensor:
-    """Return rotations [b, 3, 3] about vectors [b, 3], by their lengths in radians."""
+    """Return rotations [b, 3, 3] about vectors [b, 3], by their lengths in radians (Rodrigues)."""
     x, y, z = vectors.unbind(1)
-    zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(matrices(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1)))
+    zero, angle = torch.zeros_like(x), vectors.norm(dim=1)[:, None, None]
+    across = matrices(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1))
+    turn, back = torch.sinc(angle / torch.pi), torch.sinc(angle / (2 * torch.pi)).square() / 2
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + turn * across + back * (across @ across)
 
 
 def nearest_rotations(spread: Tensor) -> Tensor:
