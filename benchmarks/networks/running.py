@@ -49,7 +49,7 @@ def backward(network: nn.Module, how: Precision, meshes: Meshes) -> None:
     with products(how):
         with autocast(how, meshes.source.device):
             prediction = network(source=meshes.source, target=meshes.target)
-        # the literal form leaves its output rounded
+        # the literal form's output is bfloat16 under autocast
         transfer_loss(prediction.float(), truth=meshes.truth, target=meshes.target, edges=meshes.edges)[0].backward()
 
 

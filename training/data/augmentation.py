@@ -85,7 +85,8 @@ class Augmentation:
     def _subset(self, triples: Triples, batch: Batch, size: int, random: RowRandom) -> Batch:
         """So many vertices of each source and each target; more often than once where a mesh has fewer.
 
-        With them go a quarter as many edges of each target, and these edges' ends.
+        With them go edges of each target, a quarter of ``size``, some perhaps twice, and their ends are taken in any
+        case; of a target whose vertices are all taken, too.
         """
         of_source, of_target = self._rigs.areas(triples, batch) if self._rigs else (None, None)
         counts = _counts(batch.source, batch.source_counts)
@@ -108,6 +109,8 @@ class Augmentation:
 
 _OF_SOURCES = Purpose.SOURCE_SUBSET, Purpose.SOURCE_AGAIN
 _OF_TARGETS = Purpose.TARGET_SUBSET, Purpose.TARGET_AGAIN
+_NUMBERS = 24  # bits of the number of a vertex, below the 32 of a key
+_BEFORE = _NUMBERS + 32
 
 
 def _counts(meshes: Tensor, counts: Counts | None) -> Tensor:
@@ -142,10 +145,13 @@ def _drawn(
     keys = random.uniform(purposes[0], rows)
     if areas is not None:
         keys = -(1 - keys).log() / areas.clamp_min(1e-12)  # the first to come, where an area says how often they come
+    # no two alike, lest it were the device or the padding that decides: the bits of a float that is not negative order
+    # as it does
+    order = (keys.view(torch.int32).long() << _NUMBERS) + torch.arange(rows, device=keys.device)
     if always is not None and always.shape[1]:
-        keys = torch.where(torch.zeros_like(keys).scatter(1, always, 1.0) > 0, -1 - keys, keys)
-    keys = keys.masked_fill(~_inside(counts, rows), np.inf)
-    first = keys.topk(min(rows, size), largest=False).indices
+        order = order - (torch.zeros_like(order).scatter(1, always, 1) << _BEFORE)
+    order = order.masked_fill(~_inside(counts, rows), 1 << _BEFORE)
+    first = order.topk(min(rows, size), largest=False).indices
     again = random.below(purposes[1], counts[:, 0], size)
     return torch.where(_inside(counts, size), pad(first, (0, max(0, size - rows))), again)
 

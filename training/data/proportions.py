@@ -9,6 +9,7 @@ from torch import Tensor
 from datagen.characters.joint_names import pairs
 from training.data.batch import Batch
 from training.data.row_random import Purpose, RowRandom
+from training.networks.execution import sent
 from training.networks.layers.rigid_parts import ancestors, box, moved_joints, skinned
 from training.objectives.parts import Posed
 
@@ -26,14 +27,13 @@ def of_other_proportions(batch: Batch, deviation: float, joints: Mapping[str, st
     assert batch.posed is not None
     names, device = list(joints), batch.source.device
     parents = [-1 if parent is None else names.index(parent) for parent in joints.values()]
-    tree = torch.tensor([part if own < 0 else own for part, own in enumerate(parents)], device=device)
-    above = ancestors(parents).to(device)
-    alike = torch.arange(len(names), device=device)
+    tree = sent(torch.tensor([part if own < 0 else own for part, own in enumerate(parents)]), device)
+    above, alike = sent(ancestors(parents), device), list(range(len(names)))
     for left, right in pairs(names):
         alike[right] = left
     drawn = random.normal(Purpose.PROPORTIONS, 2, len(names))
     chosen = random.uniform(Purpose.RESIZED) < 0.5
-    sizes = torch.exp(deviation * drawn[:, :, alike]).to(batch.source.dtype)
+    sizes = torch.exp(deviation * drawn.index_select(2, sent(torch.tensor(alike), device))).to(batch.source.dtype)
     bodies = [
         _resized(posed, factors, tree, above) for posed, factors in zip(batch.posed, sizes.unbind(1), strict=True)
     ]

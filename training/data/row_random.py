@@ -38,8 +38,9 @@ class Purpose(IntEnum):
 class RowRandom:
     """Numbers that are a function of (seed, step, place of the row in the whole batch, purpose, index).
 
-    Each is a hash of these, so all rows of a batch are drawn together, wherever they are, and a GPU waits for nothing.
-    A row's numbers begin alike however many are drawn.
+    Each is a hash of these, so all rows of a batch are drawn together, wherever they are, and nothing waits for a GPU.
+    They are the same on every device, normal ones but for rounding. Along the first axis of a shape a row's numbers
+    begin alike however many are drawn. Keys of rows have 32 bits: in a long training a few rows share their numbers.
 
     Parameters
     ----------
@@ -55,8 +56,11 @@ class RowRandom:
         state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step)).generate_state(2)
         one, other = (int(word) for word in state)
         places = torch.arange(first, first + rows)[:, None]
-        self._host = _hashed(_hashed(places + one & _MASK) ^ other)
-        self._keys = sent(self._host, torch.device(device))
+        self._hold(_hashed(_hashed((places + one) & _MASK) ^ other), torch.device(device))
+
+    def _hold(self, keys: Tensor, device: torch.device) -> "RowRandom":
+        self._on_host, self._keys = keys, sent(keys, device)
+        return self
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -68,16 +72,11 @@ class RowRandom:
 
     def on_host(self) -> "RowRandom":
         """The same numbers in the memory of the CPU, for what Python decides by them."""
-        twin = object.__new__(RowRandom)
-        twin._host = twin._keys = self._host
-        return twin
+        return object.__new__(RowRandom)._hold(self._on_host, torch.device("cpu"))
 
     def of(self, rows: Tensor) -> "RowRandom":
-        """Those of some rows, by number [k], which are in the memory of the CPU."""
-        twin = object.__new__(RowRandom)
-        twin._host = self._host.index_select(0, rows)
-        twin._keys = sent(twin._host, self.device)
-        return twin
+        """Those of some rows; their numbers [k] lie in the memory of the CPU."""
+        return object.__new__(RowRandom)._hold(self._on_host[rows], self.device)
 
     def uniform(self, purpose: Purpose, *shape: int) -> Tensor:
         """Return [b, *shape] float32 in [0, 1), multiples of 2^-24."""
@@ -92,12 +91,13 @@ class RowRandom:
         """Return whole numbers [b, *shape], each of 0 to less than a limit, one for all or of each row [b]."""
         if isinstance(limits, Tensor):
             limits = limits.view(-1, *[1] * len(shape))
-        return self._bits(purpose, shape) * limits >> 32
+        return (self._bits(purpose, shape) * limits) >> 32
 
     def _bits(self, purpose: Purpose, shape: tuple[int, ...]) -> Tensor:
         """Whole numbers [b, *shape] of 32 random bits."""
+        assert prod(shape) <= 1 << _SHORT, "the next purpose's numbers begin there"
         numbers = torch.arange(prod(shape), device=self.device)
-        drawn = _hashed(_hashed(numbers + (int(purpose) << _SHORT) & _MASK) ^ self._keys)
+        drawn = _hashed(_hashed(numbers + (int(purpose) << _SHORT)) ^ self._keys)
         return drawn.view(len(self), *shape)
 
 

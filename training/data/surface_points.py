@@ -115,7 +115,7 @@ def points_of(
     """
     device = random.device
     corners = torch.arange(rows, device=device)[None, :, None].repeat(len(meshes), 1, 3)
-    shares = torch.tensor([1.0, 0.0, 0.0]).to(device).repeat(len(meshes), rows, 1)
+    shares = (torch.arange(3, device=device) == 0).float().repeat(len(meshes), rows, 1)
     chosen = (random.on_host().uniform(purposes[0]) < chance).tolist()
     alike = defaultdict[tuple[Triangles, int], list[int]](list)
     for row, kind in enumerate(zip(meshes, counts, strict=True)):

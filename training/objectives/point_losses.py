@@ -116,18 +116,19 @@ def avatar_loss(
 def nearest(queries: Tensor, points: Tensor) -> Tensor:
     """Return the number [q] of the point among ``[n, 3]`` that is nearest to each of ``[q, 3]``.
 
-    By a k-d tree, which takes n log n time on a CPU; on a GPU by all distances, which it has sooner than it could ask.
-    There is no gradient. What is not finite is taken to lie at the origin.
+    By a k-d tree, which takes n log n time; on a GPU by all distances, which it has sooner than it could ask. Points as
+    near as rounding tells may be taken for each other then. There is no gradient. What is not finite is taken to lie at
+    the origin.
     """
     asked, there = (tensor.detach().nan_to_num(posinf=0, neginf=0) for tensor in (queries, points))
     if not asked.is_cuda:
-        return torch.from_numpy(cKDTree(there.numpy()).query(asked.numpy())[1])
+        return torch.from_numpy(cKDTree(there.cpu().numpy()).query(asked.cpu().numpy())[1]).to(queries.device)
     some = asked.split(max(1, _DISTANCES // len(there)))  # type: ignore[no-untyped-call]
     return torch.cat([squared_distances(each, there).argmin(dim=1) for each in some])
 
 
-_DISTANCES = 2**27
-"""That are kept at a time."""
+_DISTANCES = 2**26
+"""That are worked out at a time, with as many numbers again."""
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from datagen.store import open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
-from training.data.augmentation import Augmentation
+from training.data.augmentation import Augmentation, _drawn
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom, _hashed
@@ -227,3 +227,17 @@ def test_cuda_augments_as_the_cpu_does(
     here, there = (augmented(dataset, step=step, device=device) for device in ("cpu", "cuda"))
     assert there.source.device.type == "cuda"
     alike(here, there.to("cpu"))
+
+
+@pytest.mark.parametrize("areas", [False, True])
+def test_the_same_vertices_are_drawn_however_the_batch_is_padded(areas: bool) -> None:
+    """Keys of 24 bits are often alike among thousands: what decides must not be how a library sorts."""
+    counts = torch.tensor([[6_890]])
+    for step in range(40):
+        drawn = []
+        for rows in (6_890, 40_000):
+            random = RowRandom(1, step, first=0, rows=1, device="cpu")
+            about = torch.full((1, rows), 1e-4) if areas else None
+            purposes = (Purpose.SOURCE_SUBSET, Purpose.SOURCE_AGAIN)
+            drawn.append(_drawn(random, purposes, counts, rows, 512, areas=about))
+        assert torch.equal(*drawn) and len(drawn[0].unique()) == 512 and int(drawn[0].max()) < 6_890

@@ -90,8 +90,6 @@ class Muon(torch.optim.AdamW):
 
     def _directions(self, matrices: Sequence[Tensor]) -> list[Tensor]:
         """The orthogonal matrix nearest to each, those of one shape together; ranks share them by their cost."""
-        if not matrices:
-            return []
         loads, mine = [0] * self._ranks, defaultdict(list)
         for number in sorted(range(len(matrices)), key=lambda number: -_cost(matrices[number])):
             owner = loads.index(min(loads))
