@@ -18,7 +18,7 @@ from datagen.common.errors import MeshError, storage_errors
 from datagen.mesh.files import MeshFile, write_posed
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.sequences import require_animation, write_animation
-from training.inference.domain_check import remarks, seen_by
+from training.inference.domain_check import Tears, remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
@@ -200,7 +200,11 @@ class TransferWork:
             from workflows.pipeline.progress import bar
 
             frames = bar(frames, total=count, what="transfer", unit="frame")
+        tears, is_torn = Tears(self.target.mesh), False
         for number, posed in enumerate(frames):
+            if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
+                is_torn = True
+                self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
             if number in kept:
                 self._shown[number] = posed
             if number in played:

@@ -9,7 +9,7 @@ import pytest
 from datagen.generate import generate
 from datagen.mesh.geometry import Mesh
 from tests.support.recipes import tiny_dataset, tiny_training
-from training.inference.domain_check import Seen, noted, part_sizes, remarks, seen_by
+from training.inference.domain_check import Seen, Tears, noted, part_sizes, remarks, seen_by
 from training.inference.orientation import EVERY_AXES, UPRIGHT, Axes, Orientation
 from training.inference.standing import Standing
 from workflows.pipeline.train import write_head
@@ -148,3 +148,19 @@ def test_too_few_vertices_are_no_body_however_well_they_fit(
     standing = Standing(np.eye(3), 0.0001, 1.0)
     said = list(remarks(mesh, name="A", axes=standing, way=None, both=None, stated=False, seen=seen))
     assert any(f"A has {count} vertices, too few to show how a body stands" in line for line in said) == is_said
+
+
+@pytest.mark.parametrize(
+    ("away", "size", "is_torn"), [(0.0, 1.0, False), (0.2, 1.0, False), (0.6, 1.0, True), (0.6, 300.0, True)]
+)
+def test_a_surface_is_torn_where_edges_are_pulled_across_the_body(away: float, size: float, is_torn: bool) -> None:
+    """Long ones of a coarse mesh, and short ones that grow to a tenth of it, are none."""
+    rows, columns = np.divmod(np.arange(22), 2)
+    vertices = size * np.stack([columns, rows / 10, 0 * rows], axis=1).astype(np.float64)
+    first = np.arange(0, 20, 2)
+    faces = np.concatenate([np.stack([first, first + 1, first + 2], 1), np.stack([first + 1, first + 3, first + 2], 1)])
+    posed = vertices + np.where(rows[:, None] > 5, [0, size * away, 0], 0)
+    said = Tears(Mesh(vertices, faces)).in_output(Mesh(posed, faces), name="gown.obj")
+    assert bool(said) == is_torn
+    if is_torn:
+        assert said.startswith("gown.obj comes out torn: 2 of its edges are more than 4 times as long, the longest 7")
