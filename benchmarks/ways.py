@@ -1,6 +1,6 @@
 """The modules on the way of a command: those of which a function is called, beyond being imported.
 
-python -m benchmarks.ways transfer --model anny-quickstart a.obj b.obj -o c.obj
+python -m benchmarks.ways transfer --model dsffnet-people a.obj b.obj -o c.obj
 python -m benchmarks.ways train --data DATA.zarr --out RUN --set training.launcher=inline training.ranks=1
 """
 

@@ -34,7 +34,7 @@ from workflows.avatar.outfits import outer_scan
 from workflows.pipeline.run_folder import AvatarFolder
 from workflows.pretrained import own_weights
 
-_DIRECT = {"DSFFNet": "anny-quickstart", "parts": "human", "parts, dressed": "dressed"}
+_DIRECT = {"DSFFNet": "dsffnet-people", "parts": "human", "parts, dressed": "dressed"}
 _SAMPLES, _SOURCE, _MOVES = 20_000, 11, 20
 _SKINNED, _READ, _TRUE = "template + skinning by the pose read", "avatar by the pose read", "avatar by the true pose"
 _DRAWN = {"source": "source", "truth": "truth", "the target as it is": "target", **{name: name for name in _DIRECT},

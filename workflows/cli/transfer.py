@@ -48,7 +48,7 @@ def add_model_option(made: Parser) -> None:
         "--model",
         metavar="RUN",
         help="run folder, weights, models:/NAME@ALIAS (MLflow), or what comes along: human, dressed (people in "
-        "wide clothes), animals, anny-quickstart (default: one of the first three, by the meshes)",
+        "wide clothes), animals, dsffnet-people (default: one of the first three, by the meshes)",
     )
 
 

@@ -51,4 +51,4 @@ def test_what_is_no_person_and_weights_that_read_no_poses_are_refused() -> None:
     with pytest.raises(MeshError, match="mesh 0 is no body whose pose these weights know"):
         read_poses(own_weights("human"), [Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))])
     with pytest.raises(CheckpointError, match="holds no weights of network 'parts'"):
-        read_poses(own_weights("anny-quickstart"), [])
+        read_poses(own_weights("dsffnet-people"), [])

@@ -139,7 +139,7 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
     fails(
         transfer("good.obj", model=tmp_path / "norun"),
         1,
-        "norun: there is no such run or weights. Name one; these come along: animals, anny-quickstart, dressed, human",
+        "norun: there is no such run or weights. Name one; these come along: animals, dressed, dsffnet-people, human",
     )
     fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
     assert not list(tmp_path.glob("out*"))

@@ -120,7 +120,9 @@ def test_projection_onto_parts_is_an_option(
         monkeypatch.setattr(PoseTransfer, "rest_error", lambda self, mesh, error=error: error)
         transfer("pose.obj", "person.obj", "-o", tmp_path / "d.obj", "--project", parts)
         assert (f"person.obj is no body that {parts}" in capsys.readouterr().err) == is_told
-    with pytest.raises(CheckpointError, match=r"--project humann: there is no such run .* along: animals, anny-quick"):
+    with pytest.raises(
+        CheckpointError, match=r"--project humann: there is no such run .* along: animals, dressed, dsff"
+    ):
         transfer("pose.obj", "person.obj", "-o", tmp_path / "c.obj", "--project", "humann")
     options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", "c.obj", "--project", "human"])
     with pytest.raises(RecipeError, match="--project is for outputs of a network that is named: add --model"):
