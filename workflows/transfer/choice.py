@@ -6,7 +6,7 @@ from pathlib import Path
 
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
-from training.inference.domain_check import POOR
+from training.inference.domain_check import POOR, Tears
 from training.inference.orientation import Axes
 from training.inference.standing import KNOWN, MISREAD, Standing
 from training.inference.transfer import PoseTransfer
@@ -37,9 +37,20 @@ class Chosen:
         return cls(weights, transfer, standings(transfer, job, meshes))
 
     @property
+    def is_read(self) -> bool:
+        """Whether both meshes are such bodies as the weights know."""
+        return all(found.rest_error <= MISREAD for found in self.standings)
+
+    @property
     def is_sure(self) -> bool:
         """Whether both meshes are known well."""
-        return all(found.misfit <= KNOWN and found.rest_error <= MISREAD for found in self.standings)
+        return self.is_read and all(found.misfit <= KNOWN for found in self.standings)
+
+    def tears(self, meshes: tuple[Mesh, Mesh]) -> bool:
+        """Whether the target comes out torn in the source's pose."""
+        (source, target), (source_axes, target_axes) = meshes, self.standings
+        posed = self.transfer(source=source, target=target, source_axes=source_axes, target_axes=target_axes)
+        return bool(Tears(target).in_output(posed, name=""))
 
     def reads_better_than(self, other: "Chosen") -> bool:
         """Whether both meshes have less rest error than by other weights."""
@@ -72,7 +83,8 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
 
     The others are not asked where `human` knows both well: among all the ways to turn an animal there may be one in
     which it passes for a person, but worse by far than people do. Nor is `dressed` where `animals` knows both well, and
-    better than `human` does.
+    better than `human` does. But where `human` tears the target, as it may a skirt, and `dressed` does not, the latter
+    is taken.
 
     Raises
     ------
@@ -82,7 +94,10 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     load = load or PoseTransfer.from_run
     people = Chosen.of(own_weights("human"), job, meshes, load)
     if people.is_sure:
-        return people
+        if not people.tears(meshes):
+            return people
+        dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
+        return dressed if dressed.is_read and not dressed.tears(meshes) else people
     animals = Chosen.of(own_weights("animals"), job, meshes, load)
     if animals.is_sure and animals.reads_better_than(people):
         return animals
