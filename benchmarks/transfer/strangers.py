@@ -8,6 +8,7 @@ FOLDER; by how much each mesh is misread, and how much the edges of the target a
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe, RiggedBody
 from training.evaluation import disturbances
 from training.inference.standing import MISREAD
+from training.inference.transfer import PoseTransfer
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_picture import NamedMesh, shown
 from workflows.transfer.choice import chosen
@@ -48,13 +50,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
-    rows = []
+    rows, load = [], functools.cache(PoseTransfer.from_run)
     print("| | source | target | weights | rest errors, degrees | edges stretched, median | 99% |")
     print("|---:|---|---|---|---:|---:|---:|")
     pairs = [*pairs_of_people(), *pairs_of_animals()]
     for number, (source, target) in enumerate(pairs, 1):
         job = TransferJob([Path(source.name)], Path(target.name), Path("posed.glb"), is_sequence=False)
-        taken = chosen(job, (source.mesh, target.mesh), force=True)
+        taken = chosen(job, (source.mesh, target.mesh), force=True, load=load)
         found, errors = taken.standings, [each.rest_error for each in taken.standings]
         posed = taken.transfer(source=source.mesh, target=target.mesh, source_axes=found[0], target_axes=found[1])
         words = ", ".join(f"{error:.1f}{'' if error <= MISREAD else '!'}" for error in errors)

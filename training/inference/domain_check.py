@@ -141,9 +141,9 @@ def remarks(
 
 
 class Tears:
-    """Finds whether transfers tear the surface of a target, as they do a skirt that they move with the legs.
+    """Finds edges of a target that transfers pull across the body, as they do a skirt's; not gaps at doubled vertices.
 
-    Of thirty strange meshes that were looked at, those limits pass all but the one that was torn
+    Of thirty strange meshes that were looked at, these limits pass all but the one that was torn
     (docs/results/parts.md).
     """
 
@@ -162,10 +162,10 @@ class Tears:
         torn = (after > _TORN_TIMES * self._before) & (after > _TORN_SHARE * self._size)
         if not torn.any():
             return ""
+        longest = after[torn].max() / self._size
         return (
             f"{name} comes out torn: {int(torn.sum()):,} of its edges are more than {_TORN_TIMES:g} times as long, the "
-            f"longest {after[torn].max() / self._size:.0%} of the whole. So it goes with a skirt, which moves with no "
-            "one limb (--model dressed knows wide clothes). Look at --picture"
+            f"longest {longest:.0%} of the body, as when a skirt is moved with the legs; look at --picture"
         )
 
 

@@ -83,8 +83,8 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
 
     The others are not asked where `human` knows both well: among all the ways to turn an animal there may be one in
     which it passes for a person, but worse by far than people do. Nor is `dressed` where `animals` knows both well, and
-    better than `human` does. But where `human` tears the target, as it may a skirt, and `dressed` does not, the latter
-    is taken.
+    better than `human` does. But where `human`, sure of both, tears the target in the first source's pose, as it may a
+    skirt, and `dressed` reads both and does not, the latter is taken.
 
     Raises
     ------

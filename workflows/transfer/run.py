@@ -179,8 +179,9 @@ class TransferWork:
         return written.files
 
     def posed(self) -> Iterator[Mesh]:
-        """The target in the pose of every source, one after the other."""
-        return self.transfer.sequence(
+        """The target in the pose of every source, one after the other; a line says which is torn first."""
+        tears, is_torn = Tears(self.target.mesh), False
+        frames = self.transfer.sequence(
             map(self._source, range(self.job.count)),
             self.target.mesh,
             smooth=self.job.window,
@@ -188,6 +189,11 @@ class TransferWork:
             source_axes=self.axes[0],
             target_axes=self.axes[1],
         )
+        for number, posed in enumerate(frames, 1):
+            if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
+                is_torn = True
+                self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
+            yield posed
 
     def _kept(self) -> Iterator[Mesh]:
         """The outputs, with a bar for those of a sequence; those that picture and page show are kept."""
@@ -200,11 +206,7 @@ class TransferWork:
             from workflows.pipeline.progress import bar
 
             frames = bar(frames, total=count, what="transfer", unit="frame")
-        tears, is_torn = Tears(self.target.mesh), False
         for number, posed in enumerate(frames):
-            if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
-                is_torn = True
-                self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
             if number in kept:
                 self._shown[number] = posed
             if number in played:

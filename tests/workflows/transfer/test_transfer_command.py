@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +102,23 @@ def test_refining_is_off_unless_asked(transfer: Transfer, tmp_path: Path) -> Non
     transfer("pose.obj", "person.obj", "-o", tmp_path / "b.obj", "--refine")
     plain, refined = (load_mesh(tmp_path / name).vertices for name in ("a.obj", "b.obj"))
     assert abs(plain - refined).max() > 1e-4
+
+
+def test_a_torn_target_is_told_of_once(
+    transfer: Transfer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a sequence with its first such frame, by its number."""
+
+    def tearing(self: PoseTransfer, sources: Iterator[Mesh], target: Mesh, **_: object) -> Iterator[Mesh]:
+        for number, _source in enumerate(sources):
+            yield Mesh(target.vertices * (10 if number >= 3 else 1), target.faces)
+
+    monkeypatch.setattr(PoseTransfer, "sequence", tearing)
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "a.obj")
+    assert "comes out torn" not in capsys.readouterr().err
+    transfer("walk", "person.obj", "-o", tmp_path / "torn")
+    said = capsys.readouterr().err
+    assert said.count("comes out torn") == 1 and "frame 4: person.obj comes out torn" in said
 
 
 def test_projection_onto_parts_is_an_option(
