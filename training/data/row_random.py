@@ -44,23 +44,32 @@ class RowRandom:
 
     Parameters
     ----------
-    seed, step
-        Of the training; steps done before this one.
-    first, rows
-        The place of the first row in the whole batch, and how many rows there are.
+    keys
+        Of the rows [b, 1] int64 of 32 bits, in the memory of the CPU; :meth:`of_batch` makes them.
     device
         Where numbers are wanted.
     """
 
-    def __init__(self, seed: int, step: int, *, first: int, rows: int, device: torch.device | str) -> None:
+    def __init__(self, keys: Tensor, device: torch.device) -> None:
+        self._on_host, self._keys = keys, sent(keys, device)
+
+    @classmethod
+    def of_batch(cls, seed: int, step: int, *, first: int, rows: int, device: torch.device | str) -> "RowRandom":
+        """Those of a batch's rows.
+
+        Parameters
+        ----------
+        seed, step
+            Of the training; steps done before this one.
+        first, rows
+            The place of the first row in the whole batch, and how many rows there are.
+        device
+            Where numbers are wanted.
+        """
         state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step)).generate_state(2)
         one, other = (int(word) for word in state)
         places = torch.arange(first, first + rows)[:, None]
-        self._hold(_hashed(_hashed((places + one) & _MASK) ^ other), torch.device(device))
-
-    def _hold(self, keys: Tensor, device: torch.device) -> "RowRandom":
-        self._on_host, self._keys = keys, sent(keys, device)
-        return self
+        return cls(_hashed(_hashed((places + one) & _MASK) ^ other), torch.device(device))
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -72,11 +81,11 @@ class RowRandom:
 
     def on_host(self) -> "RowRandom":
         """The same numbers in the memory of the CPU, for what Python decides by them."""
-        return object.__new__(RowRandom)._hold(self._on_host, torch.device("cpu"))
+        return RowRandom(self._on_host, torch.device("cpu"))
 
     def of(self, rows: Tensor) -> "RowRandom":
         """Those of some rows; their numbers [k] lie in the memory of the CPU."""
-        return object.__new__(RowRandom)._hold(self._on_host[rows], self.device)
+        return RowRandom(self._on_host[rows], self.device)
 
     def uniform(self, purpose: Purpose, *shape: int) -> Tensor:
         """Return [b, *shape] float32 in [0, 1), multiples of 2^-24."""

@@ -13,7 +13,8 @@ from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
-from training.data.augmentation import Augmentation, Shuffle
+from training.data.augmentation.augment import Augmentation
+from training.data.augmentation.shuffle import Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
 from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder

@@ -8,9 +8,9 @@ import torch
 
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
-from training.data.augmentation import Augmentation
+from training.data.augmentation.augment import Augmentation
+from training.data.augmentation.proportions import of_other_proportions
 from training.data.batch import Batch
-from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
 from training.data.row_random import RowRandom
 from training.data.vertex_bank import open_bank
@@ -36,7 +36,7 @@ def resized(told: Batch, deviation: float = 0.3) -> Batch:
 
 
 def random_of(batch: Batch) -> RowRandom:
-    return RowRandom(0, 0, first=0, rows=len(batch), device="cpu")
+    return RowRandom.of_batch(0, 0, first=0, rows=len(batch), device="cpu")
 
 
 def test_half_of_the_triples_change_and_the_others_are_left_as_they_are(told: Batch) -> None:

@@ -11,7 +11,7 @@ from datagen.mesh.geometry import bounding_box, edges_of
 from datagen.mesh.rig import world_rotations
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
-from training.data.augmentation import Augmentation
+from training.data.augmentation.augment import Augmentation
 from training.data.rig_table import RigTable
 from training.data.vertex_bank import open_bank
 from training.networks.layers.surface import surface_of

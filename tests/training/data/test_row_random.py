@@ -10,7 +10,7 @@ from torch import Tensor
 
 from datagen.store import open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
-from training.data.augmentation import Augmentation, _drawn
+from training.data.augmentation.augment import Augmentation, _drawn
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom, _hashed
@@ -29,7 +29,7 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 def random_of(**changes: Any) -> RowRandom:
     values: dict[str, Any] = {"seed": 1, "step": 2, "first": 0, "rows": ROWS, "device": "cpu"}
-    return RowRandom(**values | changes)
+    return RowRandom.of_batch(**values | changes)
 
 
 def largest_correlation(*rows: Tensor) -> float:
@@ -236,7 +236,7 @@ def test_the_same_vertices_are_drawn_however_the_batch_is_padded(areas: bool) ->
     for step in range(40):
         drawn = []
         for rows in (6_890, 40_000):
-            random = RowRandom(1, step, first=0, rows=1, device="cpu")
+            random = RowRandom.of_batch(1, step, first=0, rows=1, device="cpu")
             about = torch.full((1, rows), 1e-4) if areas else None
             purposes = (Purpose.SOURCE_SUBSET, Purpose.SOURCE_AGAIN)
             drawn.append(_drawn(random, purposes, counts, rows, 512, areas=about))

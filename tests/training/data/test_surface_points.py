@@ -11,7 +11,7 @@ from datagen.common.arrays import Floats
 from datagen.generate import generate
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
-from training.data.augmentation import Augmentation
+from training.data.augmentation.augment import Augmentation
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom
@@ -29,7 +29,7 @@ PURPOSES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 
 
 def random(step: int, *, rows: int) -> RowRandom:
-    return RowRandom(0, step, first=0, rows=rows, device=CPU)
+    return RowRandom.of_batch(0, step, first=0, rows=rows, device=CPU)
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_of_several_surfaces_each_mesh_has_points_of_its_own(legs: Dataset) -> N
         points = points_of(meshes, counts, 5, 0.5, together, PURPOSES)
         seen.add(points.drawn)
         for row, (mesh, count) in enumerate(zip(meshes, counts, strict=True)):
-            alone = RowRandom(0, step, first=row, rows=1, device=CPU)
+            alone = RowRandom.of_batch(0, step, first=row, rows=1, device=CPU)
             its = points_of([mesh], [count], 5, 0.5, alone, PURPOSES)
             assert its.drawn == points.drawn[row : row + 1]
             assert torch.equal(its.corners[0], points.corners[row]) and torch.equal(its.shares[0], points.shares[row])

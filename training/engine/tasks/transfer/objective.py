@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from datagen.store import Dataset
-from training.data.augmentation import Shuffle
+from training.data.augmentation.shuffle import Shuffle
 from training.data.batch import Batch
 from training.data.rig_table import RigTable
 from training.networks.execution import autocast, compiled

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from datagen.store import Dataset
-from training.data.augmentation import Augmentation
+from training.data.augmentation.augment import Augmentation
 from training.data.cache_policy import Room
 from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of

@@ -1,8 +1,6 @@
 """Random changes of a training batch: meshes turned, cut, thinned, noisy, and bodies of other proportions.
 
-The paper trains without. Shuffling vertices changes nothing for DSFFNet and NPT, which are invariant to the source's
-order and equivariant to the target's. The generator of 3D-CoreNet has a kernel of three along the list of the target's
-vertices: it learns from the order that a body model happens to list them in, unless they are shuffled.
+The paper trains without.
 """
 
 from collections.abc import Sequence
@@ -13,9 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from datagen.common.seeding import Stream
+from training.data.augmentation.proportions import of_other_proportions
 from training.data.batch import Batch, Counts, counts_of
-from training.data.proportions import of_other_proportions
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom
 from training.data.triples import Triples
@@ -59,7 +56,7 @@ class Augmentation:
         recipe = self._recipe
         if recipe == AugmentationRecipe(shuffle=recipe.shuffle):
             return self._told(triples, batch)
-        random = RowRandom(self._seed, step, first=first, rows=len(batch), device=batch.source.device)
+        random = RowRandom.of_batch(self._seed, step, first=first, rows=len(batch), device=batch.source.device)
         if recipe.points and self._rigs:
             batch = self._rigs.of_points(triples, batch, recipe.points, random)
         if recipe.turn or recipe.lean:
@@ -257,37 +254,3 @@ def _boxed(meshes: Tensor, counts: Counts | None) -> Tensor:
         return boxed(meshes)
     inside = _inside(_counts(meshes, counts), meshes.shape[1])[..., None]
     return boxed(torch.where(inside, meshes, meshes[:, :1])) * inside
-
-
-class Shuffle:
-    """Another order of the target's vertices at each step, undone in what comes out.
-
-    Meshes of one vertex count share an order, a function of (seed, step, count).
-    """
-
-    def __init__(self, batch: Batch, *, seed: int, step: int) -> None:
-        rows = batch.target.shape[1]
-        orders = {
-            count: torch.cat([_order(seed, step, count), torch.arange(count, rows)])
-            for count in set(batch.target_counts or (rows,))
-        }
-        counts = batch.target_counts or (rows,) * len(batch)
-        self._index = torch.stack([orders[count] for count in counts]).to(batch.target.device)[..., None]
-
-    def __call__(self, vertices: Tensor) -> Tensor:
-        """Vertices [b, n, 3] in the new order."""
-        return vertices.gather(1, self._index.expand(vertices.shape))
-
-    def undone(self, vertices: Tensor) -> Tensor:
-        """Vertices [b, n, 3] in their own order again."""
-        return torch.zeros_like(vertices).scatter(1, self._index.expand(vertices.shape), vertices)
-
-
-def _order(seed: int, step: int, count: int) -> Tensor:
-    state = np.random.SeedSequence((seed, int(Stream.AUGMENTATION), step, _SHUFFLED - count)).generate_state(
-        1, np.uint64
-    )
-    return torch.randperm(count, generator=torch.Generator().manual_seed(int(state[0])))
-
-
-_SHUFFLED = 2**63  # less a vertex count: no place of a triple in a batch

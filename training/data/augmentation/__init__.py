@@ -1,0 +1,1 @@
+"""What changes a training batch at random before a network sees it."""
