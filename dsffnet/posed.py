@@ -19,9 +19,7 @@ from datagen.mesh.formats.surface import Alone, Encoded, Surface
 from datagen.mesh.geometries import CHOOSE, require_one_body
 from datagen.mesh.geometry import Mesh, check_mesh
 from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
-from training.inference.domain_check import Tears
 from training.inference.orientation import axes_of_both
-from training.inference.transfer import REFINE_WEIGHT
 from workflows.cli.transfer import weights_of
 from workflows.pipeline.console import warn
 from workflows.transfer.job import TransferJob
@@ -91,15 +89,7 @@ def _posed(source: Any, target: Any, options: Options) -> PosedMesh:
             force=options.force,
             warn=lambda line: warn(_of_python(line)),
         )
-        found = work.transfer(
-            source=read[0].mesh,
-            target=read[1].mesh,
-            source_axes=work.axes[0],
-            target_axes=work.axes[1],
-            refine=REFINE_WEIGHT if options.refine else 0.0,
-        )
-    if line := Tears(read[1].mesh).in_output(found, name=str(job.target)):
-        warn(_of_python(line))
+        found = next(work.posed())
     return PosedMesh(np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64), job, read[1])
 
 

@@ -22,13 +22,15 @@ Load = Callable[..., PoseTransfer]
 class Chosen:
     """Weights, their network, and how source and target stand, as the network finds or a person says.
 
-    ``doubts``: of each of the two, why it may be no body at all, or nothing.
+    ``doubts``: of each of the two, why it may be no body at all, or nothing. ``posed``: the target in the source's
+    pose, where that was tried.
     """
 
     weights: Path
     transfer: PoseTransfer
     standings: Pair
     doubts: tuple[str, str] = ("", "")
+    posed: Mesh | None = None
 
     @classmethod
     def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh], load: Load) -> "Chosen":
@@ -46,11 +48,15 @@ class Chosen:
         """Whether both meshes are known well."""
         return self.is_read and all(found.misfit <= KNOWN for found in self.standings)
 
-    def tears(self, meshes: tuple[Mesh, Mesh]) -> bool:
-        """Whether the target comes out torn in the source's pose."""
+    def tried(self, meshes: tuple[Mesh, Mesh]) -> "Chosen":
+        """The same with the target in the source's pose."""
         (source, target), (source_axes, target_axes) = meshes, self.standings
         posed = self.transfer(source=source, target=target, source_axes=source_axes, target_axes=target_axes)
-        return bool(Tears(target).in_output(posed, name=""))
+        return replace(self, posed=posed)
+
+    def tears(self, target: Mesh) -> bool:
+        """Whether the target came out torn where it was tried."""
+        return self.posed is not None and bool(Tears(target).in_output(self.posed, name=""))
 
     def reads_better_than(self, other: "Chosen") -> bool:
         """Whether both meshes have less rest error than by other weights."""
@@ -94,10 +100,12 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     load = load or PoseTransfer.from_run
     people = Chosen.of(own_weights("human"), job, meshes, load)
     if people.is_sure:
-        if not people.tears(meshes):
+        people = people.tried(meshes)
+        if not people.tears(meshes[1]):
             return people
         dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
-        return dressed if dressed.is_read and not dressed.tears(meshes) else people
+        dressed = dressed.tried(meshes) if dressed.is_read else dressed
+        return dressed if dressed.is_read and not dressed.tears(meshes[1]) else people
     animals = Chosen.of(own_weights("animals"), job, meshes, load)
     if animals.is_sure and animals.reads_better_than(people):
         return animals

@@ -47,12 +47,15 @@ class TransferWork:
         first: Mesh,
         target: MeshFile,
         by: str = "",
+        known: Mesh | None = None,
         warn: Callable[[str], None] = warn,
     ) -> None:
-        """``first`` is the source, or the first frame of a sequence; ``by``: weights that were chosen."""
+        """``first`` is the source, or the first frame of a sequence; ``by``: weights that were chosen; ``known``: what
+        comes of the first, neither smoothed nor refined, where it is known.
+        """
         self.job, self.transfer, self.first, self.target = job, transfer, first, target
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
-        self.by, self._warn = by, warn
+        self.by, self._known, self._warn = by, known, warn
         self._shown: dict[int, Mesh] = {}
         self._played: dict[int, Mesh] = {}
         self._beside: list[Path] = []
@@ -81,7 +84,8 @@ class TransferWork:
         meshes = first, target.mesh
         if weights is None:
             found = chosen(job, meshes, force=force, load=load)
-            work = cls(job, found.transfer, first=first, target=target, by=found.weights.name, warn=warn)
+            by = found.weights.name
+            work = cls(job, found.transfer, first=first, target=target, by=by, known=found.posed, warn=warn)
             work._take(found.standings, found.weights, found.doubts)
             return work
         transfer = (load or PoseTransfer.from_run)(weights, project=job.project)
@@ -181,7 +185,16 @@ class TransferWork:
     def posed(self) -> Iterator[Mesh]:
         """The target in the pose of every source, one after the other; a line says which is torn first."""
         tears, is_torn = Tears(self.target.mesh), False
-        frames = self.transfer.sequence(
+        for number, posed in enumerate(self._frames(), 1):
+            if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
+                is_torn = True
+                self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
+            yield posed
+
+    def _frames(self) -> Iterator[Mesh]:
+        if self._known and not (self.job.is_sequence or self.job.refine):
+            return iter([self._known])
+        return self.transfer.sequence(
             map(self._source, range(self.job.count)),
             self.target.mesh,
             smooth=self.job.window,
@@ -189,11 +202,6 @@ class TransferWork:
             source_axes=self.axes[0],
             target_axes=self.axes[1],
         )
-        for number, posed in enumerate(frames, 1):
-            if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
-                is_torn = True
-                self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
-            yield posed
 
     def _kept(self) -> Iterator[Mesh]:
         """The outputs, with a bar for those of a sequence; those that picture and page show are kept."""

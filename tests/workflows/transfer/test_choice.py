@@ -82,6 +82,7 @@ def choose(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> Choose:
         asked = 1 if source is target is PERSON else 2 if source is target is ANIMAL else 3
         is_torn = any(target is each for each in (TIGHT_SKIRT, NET))
         assert loaded == (["human", "dressed"] if is_torn else ["human", "animals", "dressed"][:asked])
+        assert (found.posed is None) == ("animals" in loaded), "tried where human is sure of both"
         said[:] = found.doubts
         return found.weights.name, [each.rest_error for each in found.standings]
 

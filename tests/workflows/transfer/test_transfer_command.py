@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,15 @@ def test_a_torn_target_is_told_of_once(
     transfer("walk", "person.obj", "-o", tmp_path / "torn")
     said = capsys.readouterr().err
     assert said.count("comes out torn") == 1 and "frame 4: person.obj comes out torn" in said
+
+
+def test_what_was_tried_is_not_posed_again_unless_it_is_to_be_refined(run: Path) -> None:
+    source, target = (read_mesh_file(run.parent / name) for name in ("pose.obj", "person.obj"))
+    job = TransferJob([source.path], target.path, Path("out.obj"), is_sequence=False)
+    for refine in (False, True):
+        given = replace(job, refine=refine), PoseTransfer.from_run(run)
+        work = TransferWork(*given, first=source.mesh, target=target, known=target.mesh)
+        assert (next(work.posed()) is target.mesh) != refine
 
 
 def test_projection_onto_parts_is_an_option(
