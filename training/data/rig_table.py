@@ -108,10 +108,11 @@ class RigTable:
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
     def areas(self, triples: Triples, batch: Batch) -> tuple[Tensor | None, Tensor | None]:
-        """By what share of the area at rest lies around them vertices [b, n] of sources and of targets are to be drawn.
+        """How likely vertices of the sources [b, n] and of the targets are to be drawn, in any unit.
 
-        That of the first identity with the same weights. Meshes of no more vertices than a network samples are drawn
-        from alike, as of others it leaves out most in faces and hands, too; so are points, which lie evenly. None: all.
+        By the share of the area at rest around each, of the first identity with the same weights: of dense meshes a
+        network's sample leaves out most in faces and hands, too. All alike in meshes of no more vertices than that
+        sample, and of points, which lie evenly. None: so are all meshes.
         """
         source, target = batch.points or (None, None)
         return (

@@ -157,7 +157,7 @@ class Tears:
         return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
     def in_output(self, posed: Mesh, *, name: str) -> str:
-        """What to say of an output in the target's size; nothing where it is not torn."""
+        """Return what to say of an output, called ``name``, in the target's unit; "" where it is not torn."""
         after = self._lengths(posed)
         torn = (after > _TORN_TIMES * self._before) & (after > _TORN_SHARE * self._size)
         if not torn.any():
