@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,7 +50,7 @@ def make_outfits(recipe: AvatarWorkflow, folder: AvatarFolder, tasks: TaskRunner
         if not outfit.field.is_sound:
             _field(recipe.field, subject).save(outfit.field.path)
         if not (outfit.samples.is_sound and outfit.surfaces.is_sound):
-            _draw(recipe.scans, outfit, subject, tasks)
+            draw_points(recipe.scans, outfit, subject, tasks)
 
 
 def sources(recipe: AvatarWorkflow, folder: AvatarFolder) -> dict[str, str]:
@@ -196,10 +196,11 @@ def _field(recipe: FieldRecipe, subject: Subject) -> SkinningField:
     return diffused_skinning(subject.body, **recipe.model_dump(), progress=progress)
 
 
-def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunner) -> None:
+def draw_points(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunner) -> None:
+    """Write the points of all scans of an outfit whose body, scans and field are there."""
     frames = len(subject.scans)
     arguments = [(str(outfit.path), frame, recipe.around, recipe.surface) for frame in range(frames)]
-    found = list(
+    found: list[DrawnFrame] = list(
         bar(
             tasks.frames(draw_frame, arguments, what=f"points of {outfit.name}"),
             total=frames,
@@ -207,7 +208,8 @@ def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunne
             unit="scan",
         )
     )
-    around, points, normals = zip(*found, strict=True)
+    found.sort(key=lambda drawn: drawn.frame)  # tasks end in any order
+    _, around, points, normals = zip(*found, strict=True)
     least = min(len(its) for its in points)
     SurfaceSamples(*(torch.stack([its[:least] for its in each]) for each in (points, normals))).save(
         outfit.surfaces.path
@@ -223,8 +225,17 @@ def _draw(recipe: ScanRecipe, outfit: Outfit, subject: Subject, tasks: TaskRunne
     ).save(outfit.samples.path)
 
 
-def draw_frame(place: str, frame: int, around: int, surface: int) -> tuple[FrameSamples, torch.Tensor, torch.Tensor]:
-    """Points around a scan, and points and normals of its outer surface; a function of the outfit and the frame."""
+class DrawnFrame(NamedTuple):
+    """Points around the scan of a frame, and points [n, 3] with normals [n, 3] of its outer surface."""
+
+    frame: int
+    around: FrameSamples
+    points: torch.Tensor
+    normals: torch.Tensor
+
+
+def draw_frame(place: str, frame: int, around: int, surface: int) -> DrawnFrame:
+    """Draw the points of a frame, a function of the outfit and the frame; a task."""
     outfit = Outfit(Path(place))
     subject, random = outfit.subject.load(), generator(0, Stream.AUGMENTATION, frame + 1)
     scan = solid_parts(subject, frame)
@@ -233,7 +244,7 @@ def draw_frame(place: str, frame: int, around: int, surface: int) -> tuple[Frame
         random, scan, body=subject.body, field=outfit.field.load(), transforms=transforms, count=around
     )
     points, normals = surface_points(random, scan, surface)
-    return samples, torch.from_numpy(points).float(), torch.from_numpy(normals).float()
+    return DrawnFrame(frame, samples, torch.from_numpy(points).float(), torch.from_numpy(normals).float())
 
 
 def solid_parts(subject: Subject, frame: int) -> list[Mesh]:

@@ -77,7 +77,7 @@ class TaskRunner:
         return lambda task, arguments: self._run(task, arguments, here=here)
 
     def frames(self, task: Callable[..., Any], arguments: list[tuple[Any, ...]], *, what: str) -> Iterator[Any]:
-        """Run a task for each of some frames, a second or so each."""
+        """Run a task for each of some frames, a second or so each; what they return comes in any order."""
         return self._run(task, arguments, here=self._decide(what, len(arguments), "frames", RAY_FROM_FRAMES))
 
     def training(self, recipe: TrainingRecipe) -> TrainingRecipe:

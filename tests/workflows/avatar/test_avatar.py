@@ -23,8 +23,8 @@ from tests.support.commands import command
 from tests.support.shapes.outfits import drawn_outfit, person_arrays, stockinged
 from workflows.avatar.animate import poses_of
 from workflows.avatar.evaluate import Measured, markdown
-from workflows.avatar.outfits import can_be_draped_again, is_of, outer_scan, require_people, wearers
-from workflows.avatar.recipe import known_avatars, load_avatar
+from workflows.avatar.outfits import can_be_draped_again, draw_points, is_of, outer_scan, require_people, wearers
+from workflows.avatar.recipe import ScanRecipe, known_avatars, load_avatar
 from workflows.avatar.run import run_avatar
 from workflows.pipeline.run_folder import AvatarFolder
 from workflows.pipeline.tasks import TaskRunner
@@ -143,6 +143,18 @@ def test_hidden_triangles_of_a_scan_do_not_count() -> None:
     )
     found = outer_scan(subject, 0)
     assert len(found.faces) == 320 and found.faces.max() < 162, "the garment within the body is hidden"
+
+
+def test_the_points_of_a_frame_are_its_own_in_whatever_order_tasks_end(tmp_path: Path) -> None:
+    outfit = drawn_outfit(tmp_path, with_template=False)
+    files, kept = (outfit.samples.path, outfit.surfaces.path), list[list[bytes]]()
+    for turned in (iter, reversed):
+        tasks: Any = SimpleNamespace(
+            frames=lambda task, arguments, what, turned=turned: turned([task(*each) for each in arguments])
+        )
+        draw_points(ScanRecipe(around=64, surface=100), outfit, outfit.subject.load(), tasks)
+        kept.append([file.read_bytes() for file in files])
+    assert kept[0] == kept[1]
 
 
 def test_people_are_called_by_their_outfits_and_numbered_where_two_wear_one() -> None:
