@@ -22,7 +22,7 @@ from training.inference.predict import load_trained
 from training.inference.standing import Understanding, facing, standing, understanding_of
 from training.inference.transfer import PoseTransfer
 from training.networks.parts import Parts
-from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
+from training.objectives import PMD_UNIT
 from workflows.pretrained import weights_named
 
 BODIES: tuple[tuple[AnnyTopology, int, int], ...] = (
@@ -149,7 +149,7 @@ def aligned(one: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[NDArr
 
 def pmd(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """PMD of vertices [n, 3] in the units of tables."""
-    return float(np.square(one - other).mean()) / POINT_MESH_DISTANCE_SCALE
+    return float(np.square(one - other).mean()) / PMD_UNIT
 
 
 def sideways(random: np.random.Generator) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from training.evaluation import disturbances
 from training.inference.standing import MISREAD
 from training.inference.transfer import PoseTransfer
 from training.viz.comparison_figure import comparison_figure
-from training.viz.transfer_picture import NamedMesh, shown
+from training.viz.transfer_example import NamedMesh, shown
 from workflows.transfer.choice import chosen
 from workflows.transfer.job import TransferJob
 

@@ -123,6 +123,11 @@ def vertex_normals(vertices: Floats, faces: Integers) -> NDArray[np.float64]:
     return np.where(length > 0, total / np.maximum(length, 1e-30), (0.0, 1.0, 0.0))
 
 
+def triangles_of(quads: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles [2 quad, 3] of quads [quad, 4], split along the first diagonal: all first halves, then all second."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
 def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:
     """Unique undirected edges [edge, 2] of triangles [face, 3], sorted."""
     corners = np.asarray(faces, np.int64).T

@@ -5,6 +5,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from datagen.mesh.geometry import triangles_of
+
 _CORNERS = tuple(product((0, 1), repeat=3))
 
 
@@ -20,7 +22,7 @@ def surface_nets(field: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     number = np.full(mixed.shape, -1)
     number[mixed] = np.arange(len(cells))
     quads = [_quads(inside, number, axis) for axis in range(3)]
-    return cells + _crossings(corners[mixed]), _triangles(np.concatenate(quads))
+    return cells + _crossings(corners[mixed]), triangles_of(np.concatenate(quads))
 
 
 def _corner(field: NDArray[np.float64], corner: tuple[int, ...]) -> NDArray[np.float64]:
@@ -50,7 +52,3 @@ def _quads(inside: NDArray[np.bool_], number: NDArray[np.int64], axis: int) -> N
     around = np.stack([cells[i, j - 1, k - 1], cells[i, j, k - 1], cells[i, j, k], cells[i, j - 1, k]], axis=1)
     leaving = along[i, j, k]
     return np.where(leaving[:, None], around, around[:, ::-1])
-
-
-def _triangles(quads: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

@@ -19,7 +19,7 @@ from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, check_vertices, read_array
 from datagen.store.attributes import attributes_fault
 from datagen.store.codec import ShardCodec
-from datagen.store.manifest import Manifest, ManifestRow, changed_objects, covers, is_sealed, read_manifest
+from datagen.store.manifest import Manifest, changed_objects, covers, is_sealed, read_manifest
 from datagen.store.objects import read_bytes, stored_sizes
 from datagen.store.schema import (
     attributes_of,
@@ -68,11 +68,6 @@ class Dataset:
     def uuid(self) -> str:
         """Identity of the content: equal for two datasets made from one recipe and one set of assets."""
         return str(self.attributes["uuid"])
-
-    @cached_property
-    def manifest(self) -> list[ManifestRow]:
-        """One row a shard, ordered by place."""
-        return self.committed.shards if self.committed else []
 
     @cached_property
     def committed(self) -> Manifest | None:

@@ -11,8 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -20,6 +19,8 @@ import composefile
 import psutil
 from composefile import ROOT
 from processes import clean_environment
+
+from tests.support.commands import wait_for
 
 _NETWORK = "10.77.0"
 _S3 = {
@@ -52,13 +53,6 @@ def why_not() -> str:
     done = subprocess.run([*_UNSHARE, _PROBE], capture_output=True, text=True, check=False)
     words = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
     return f"namespaces, or what is needed in them, are not allowed here: {words}" if done.returncode else ""
-
-
-def wait_for(happened: Callable[[], object], seconds: float, *, what: str, every: float = 0.05) -> None:
-    until = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < until, f"waited {seconds:.0f} s in vain for {what}"
-        time.sleep(every)
 
 
 class Namespaces:

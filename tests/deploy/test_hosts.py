@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 import torch
-from hosts import Host, Lab, wait_for, why_not
+from hosts import Host, Lab, why_not
 
 from datagen.generate import generate
 from datagen.store import open_dataset
 from datagen.store.verify import find_faults
+from tests.support.commands import wait_for
 from tests.support.files import tree_hash
 from training.checkpoints.checkpoint import load_checkpoint
 from training.tracking.journal import read_journal

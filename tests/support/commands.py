@@ -6,7 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from workflows.pipeline.console import guarded
@@ -55,6 +56,23 @@ def example(name: str, *arguments: object, folder: Path) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def wait_for(
+    happened: Callable[[], object],
+    seconds: float = 200,
+    *,
+    process: subprocess.Popen[str] | None = None,
+    what: str = "the moment",
+    every: float = 0.01,
+) -> None:
+    """Wait until something has happened, for so many seconds at most; by a process, where one is given, that lives."""
+    until = time.monotonic() + seconds
+    while not happened():
+        if process and process.poll() is not None:
+            raise AssertionError(f"ended before {what}:\n{process.stdout.read() if process.stdout else ''}")
+        assert time.monotonic() < until, f"waited {seconds:.0f} s in vain for {what}"
+        time.sleep(every)
 
 
 def fails(result: Done, status: int, *says: str) -> None:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -16,6 +16,7 @@ import torch
 
 from datagen.generate import generate
 from datagen.store import open_dataset
+from tests.support.commands import wait_for
 from tests.support.disk import grow, small_disk
 from tests.support.files import tree_hash
 from training.checkpoints.checkpoint import require_checkpoint
@@ -93,14 +94,6 @@ def is_agent(process: psutil.Process) -> bool:
         return process.name().endswith("Agent")
     except psutil.Error:
         return False
-
-
-def wait_for(happened: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 200) -> None:
-    until = time.monotonic() + seconds
-    while not happened():
-        assert process.poll() is None, f"ended before the moment to kill it:\n{process.stdout.read()}"  # type: ignore[union-attr]
-        assert time.monotonic() < until, "the moment to kill it never came"
-        time.sleep(0.01)
 
 
 def family(process: subprocess.Popen[str], title: str) -> list[psutil.Process]:
@@ -230,7 +223,7 @@ def test_going_on_with_other_intervals_and_refusing_another_recipe(undisturbed: 
 def test_sigterm_of_the_driver_while_training_writes_a_checkpoint(undisturbed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = start(out, *longer(out))
-    wait_for(lambda: trained_steps(out) >= 30, process)
+    wait_for(lambda: trained_steps(out) >= 30, process=process)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 143 and "stopped at step" in output, output
@@ -252,7 +245,7 @@ def test_sigkill_of_the_driver_in_every_stage(undisturbed: Path, tmp_path: Path)
     ]
     for moment in moments:
         process = start(out, *longer(out))
-        wait_for(moment, process)
+        wait_for(moment, process=process)
         process.send_signal(signal.SIGKILL)
         process.wait()
     status, output = run(out, *longer(out))
@@ -264,7 +257,9 @@ def test_sigkill_of_ray_workers_while_generating(undisturbed: Path, tmp_path: Pa
     out = tmp_path / "out"
     process = start(out, *on_ray(out))
     for count in (2, 60):
-        wait_for(lambda count=count: shards(out) >= count and bool(family(process, "ray::ensure_shard")), process)  # type: ignore[misc]
+        wait_for(
+            lambda count=count: shards(out) >= count and bool(family(process, "ray::ensure_shard")), process=process
+        )  # type: ignore[misc]
         for worker in family(process, "ray::ensure_shard"):
             worker.send_signal(signal.SIGKILL)
     output, _ = process.communicate(timeout=300)
@@ -282,7 +277,7 @@ def test_sigkill_of_a_server_of_ray(stage: str, server: str, undisturbed: Path, 
     out = tmp_path / "out"
     arguments, done = (on_ray(out), shards) if stage == "generate" else (longer(out), trained_steps)
     process = start(out, *arguments)
-    wait_for(lambda: done(out) >= 30 and bool(family(process, "ray::")), process)
+    wait_for(lambda: done(out) >= 30 and bool(family(process, "ray::")), process=process)
     last_words = assert_ends_with_its_server(process, server)
     record = read_record(out / ("run" if stage == "train" else "generate"))
     killed = last_words.startswith(ENDED)  # as by SIGKILL: what follows sees that it no longer runs
@@ -314,7 +309,7 @@ def test_nothing_of_ray_outlives_a_driver_that_is_ended_while_it_trains(tmp_path
     for number, status in ((signal.SIGINT, 130), (signal.SIGHUP, 129), (signal.SIGKILL, -9)):
         before = trained_steps(out)
         process = start(out, *longer(out))
-        wait_for(lambda before=before: trained_steps(out) >= before + 10, process)  # type: ignore[misc]
+        wait_for(lambda before=before: trained_steps(out) >= before + 10, process=process)  # type: ignore[misc]
         rays = family(process, "ray")
         assert len(rays) > 4
         process.send_signal(number)
@@ -329,7 +324,7 @@ def test_sigkill_of_a_training_rank(undisturbed: Path, tmp_path: Path) -> None:
     """The group starts again by itself, from the newest checkpoint, and ends equal to an undisturbed training."""
     out = tmp_path / "out"
     process = start(out, *longer(out))
-    wait_for(lambda: trained_steps(out) >= 60, process)
+    wait_for(lambda: trained_steps(out) >= 60, process=process)
     ranks = family(process, "ray::RayTrainWorker")
     assert len(ranks) == 2, [p.cmdline() for p in psutil.Process(process.pid).children(recursive=True)]
     ranks[1].send_signal(signal.SIGKILL)

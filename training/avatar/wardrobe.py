@@ -68,7 +68,7 @@ class Wardrobe:
     ----------
     subjects, templates
         Of the outfits.
-    network
+    recipe
         Sizes of the network.
     """
 

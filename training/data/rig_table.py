@@ -232,7 +232,7 @@ class RigTable:
         owner = self._owners(rig)
         weights = np.zeros((len(rig.weights), len(self._names)), np.float32)
         np.add.at(weights.T, owner, rig.weights.T)
-        at = np.stack([self._place(part, owner, joints, rig) for part in range(len(self._names))])
+        at = np.stack([self._place(part, joints, rig) for part in range(len(self._names))])
         half = (vertices.max(axis=0) - vertices.min(axis=0)).max() / 2
         root = at[0]
         return weights, ((vertices - root) / half).astype(np.float32), ((at - root) / half).astype(np.float32)
@@ -245,7 +245,7 @@ class RigTable:
             owners.append(known.get(driver, owners[parent] if parent >= 0 else 0))
         return np.array(owners)
 
-    def _place(self, part: int, owner: NDArray[np.int64], joints: NDArray[np.float64], rig: Rig) -> NDArray[np.float64]:
+    def _place(self, part: int, joints: NDArray[np.float64], rig: Rig) -> NDArray[np.float64]:
         """Where the joint [3] of a part rests; of one that the body lacks, where that above it does."""
         drivers = np.array([self._poses[driver] if driver >= 0 else "" for driver in rig.drivers])
         while part != int(self._parents[part]) and not (drivers == self._names[part]).any():

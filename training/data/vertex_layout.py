@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datagen.grid import HOLE, SPLITS, Split
-from datagen.mesh.geometry import Box, bounds
+from datagen.mesh.geometry import bounding_box
 from datagen.store import Dataset
 from datagen.store.objects import is_local
 
@@ -28,8 +28,7 @@ def normalised(meshes: Floats) -> Floats:
 
     The box's centre goes to the origin, half its longest edge to one (DSFFNet, section 4.1, after NPT).
     """
-    low, high = bounds(meshes)
-    return Box((low + high) / 2, (high - low).max(axis=-1) / 2).normalise(meshes).astype(np.float32, copy=False)
+    return bounding_box(meshes).normalise(meshes).astype(np.float32, copy=False)
 
 
 def readers_of(dataset: Dataset) -> int:

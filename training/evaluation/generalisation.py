@@ -18,6 +18,7 @@ from training.evaluation.results import Score, Triple
 from training.evaluation.robustness import NO_OP, Case, SourceCount, case_of, first_triples
 from training.evaluation.statistics import mean
 from training.inference.mesh_reading import normalised
+from training.objectives import PMD_UNIT
 
 
 @dataclass(frozen=True)
@@ -148,15 +149,15 @@ def no_op_line(rows: Sequence[GeneralisationRow], kinds: Sequence[str], field: s
 
 
 def grid_table(
-    rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str, *, field: str = "pmd", factor: float = 1e4
+    rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str, *, field: str = "pmd", unit: float = PMD_UNIT
 ) -> Table:
     """The grid of one method, sources down, targets across, and the no-op as the last line."""
     lines = [["source \\ target", *kinds]]
     for kind, means in zip(kinds, grid_of(rows, kinds, method, field), strict=True):
-        lines.append([kind, *(_cell(value, factor) for value in means)])
-    lines.append([NO_OP, *(_cell(value, factor) for value in no_op_line(rows, kinds, field))])
+        lines.append([kind, *(_cell(value, unit) for value in means)])
+    lines.append([NO_OP, *(_cell(value, unit) for value in no_op_line(rows, kinds, field))])
     return Table(lines)
 
 
-def _cell(value: float, factor: float) -> str:
-    return f"{value * factor:.1f}" if np.isfinite(value) else "–"
+def _cell(value: float, unit: float) -> str:
+    return f"{value / unit:.1f}" if np.isfinite(value) else "–"

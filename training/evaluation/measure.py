@@ -28,7 +28,7 @@ from training.evaluation.results import Dressed, Row, Score
 from training.inference.mesh_reading import takes_surfaces, transferred
 from training.inference.predict import load_trained, predict
 from training.inference.projection import OntoParts
-from training.objectives import metrics
+from training.objectives import PMD_UNIT, metrics
 from training.recipes.training import EvaluationRecipe
 
 NO_OPS = ("target unchanged", "source unchanged")
@@ -314,5 +314,5 @@ def _edges(faces: bytes) -> NDArray[np.int64]:
 
 def in_words(score: Score) -> str:
     """PMD and millimetres, for a caption."""
-    pmd = score.pmd * 1e4
+    pmd = score.pmd / PMD_UNIT
     return f"PMD {pmd:.{1 if pmd < 99.95 else 0}f}e-4, {score.millimetres:.0f} mm"

@@ -21,6 +21,7 @@ from training.evaluation.measure import NO_OPS, POSE_TYPES, LoadedMethod, score,
 from training.evaluation.results import Score, Triple
 from training.evaluation.statistics import mean, mean_and_interval
 from training.inference.mesh_reading import normalised
+from training.objectives import PMD_UNIT
 
 NO_OP = NO_OPS[0]
 
@@ -227,7 +228,7 @@ def _limit(levels: Sequence[Level]) -> tuple[str, str]:
     if not levels:
         return "not taken", ""
     amount = doubled(levels)
-    return "never" if amount is None else f"{amount:g}", f"{levels[-1].mean * 1e4:.2f}"
+    return "never" if amount is None else f"{amount:g}", f"{levels[-1].mean / PMD_UNIT:.2f}"
 
 
 def amounts_table(rows: Sequence[RobustnessRow]) -> Table:
@@ -247,5 +248,9 @@ def amounts_table(rows: Sequence[RobustnessRow]) -> Table:
 def _cells(pmd: Sequence[Level], millimetres: Sequence[Level], amount: float) -> tuple[str, str, str]:
     for level, distance in zip(pmd, millimetres, strict=True):
         if level.amount == amount:
-            return f"{level.mean * 1e4:.2f}", f"{level.low * 1e4:.2f} to {level.high * 1e4:.2f}", f"{distance.mean:.1f}"
+            return (
+                f"{level.mean / PMD_UNIT:.2f}",
+                f"{level.low / PMD_UNIT:.2f} to {level.high / PMD_UNIT:.2f}",
+                f"{distance.mean:.1f}",
+            )
     return "", "", ""

@@ -7,9 +7,6 @@ import numpy as np
 
 from datagen.common.arrays import Floats
 
-PMD_UNIT = 1e-4
-"""Unit of PMD in tables and figures (paper, Table 1)."""
-
 
 @dataclass(frozen=True)
 class RunCurve:

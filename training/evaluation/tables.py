@@ -13,6 +13,7 @@ from training.evaluation.measure import CONTROLS, NO_OPS, POSE_TYPES, SKINNED
 from training.evaluation.results import Dressed, Row, is_dressed
 from training.evaluation.statistics import BOOTSTRAP, differences, interval, spread_over, values_of
 from training.evaluation.timing import Inference
+from training.objectives import PMD_UNIT
 from training.recipes.networks import DSFFNET
 
 THEIRS = "paper"
@@ -47,9 +48,9 @@ class Column:
 
 
 COLUMNS = (
-    Column("PMD x1e-4", "pmd", 1e4, 2),
-    Column("PMD re-centred", "pmd_recentred", 1e4, 2),
-    Column("PMD by area", "pmd_by_area", 1e4, 2),
+    Column("PMD x1e-4", "pmd", 1 / PMD_UNIT, 2),
+    Column("PMD re-centred", "pmd_recentred", 1 / PMD_UNIT, 2),
+    Column("PMD by area", "pmd_by_area", 1 / PMD_UNIT, 2),
     Column("CD x1e-4", "chamfer", 1e4, 2),
     Column("EMD x1e-3", "earth_mover", 1e3, 2),
     Column("mm", "millimetres", 1.0, 1),

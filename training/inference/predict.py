@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from training.checkpoints.checkpoint import Checkpoint, Which, recipe_of, require_checkpoint
+from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.weights import fill_network
 from training.inference.mesh_reading import takes_surfaces
 from training.networks import network_from
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 _MESHES_AT_ONCE = 8
 
 
-def load_trained(run: Path, which: Which = "result") -> tuple[nn.Module, TrainingRecipe, int]:
+def load_trained(run: Path) -> tuple[nn.Module, TrainingRecipe, int]:
     """Return the network of a run with its weights, the recipe it was trained by, and the step.
 
-    The weights are the newest sound ones or, where early stopping ended the run, the best; or those of ``which``.
+    The weights are the newest sound ones or, where early stopping ended the run, the best.
 
     Raises
     ------
     CheckpointError
         The run has no usable checkpoint, or its network is none of this version.
     """
-    checkpoint = require_checkpoint(run, which, weights_only=True)
+    checkpoint = require_checkpoint(run, "result", weights_only=True)
     recipe = recipe_of(checkpoint, network_only=True)
     network = network_from(recipe.network)
     load_weights(network, checkpoint)

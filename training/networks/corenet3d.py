@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import AbstractContextManager
-from typing import Literal, NamedTuple, cast
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from torch.nn.utils.parametrize import is_parametrized
 from training.networks.layers.elain import SLOPE, Generator, Identity, iterated_once
 from training.networks.layers.input_checks import check_norm_weights, check_pair, check_widths
 from training.networks.layers.modulation import VARIANCE_FLOOR, full_precision, vertex_mean, with_zero_gradients
-from training.networks.layers.optimal_transport import transport_matrix, warp
+from training.networks.layers.optimal_transport import warp
 from training.networks.layers.sampling import masses_by
 
 INITIAL_GAIN = 0.02
@@ -21,17 +21,6 @@ INITIAL_GAIN = 0.02
 
 RESIDUAL_BLOCKS = 4
 """Residual blocks after the feature layers (released code)."""
-
-
-class Transfer(NamedTuple):
-    """An output of `CoreNet3D` with the correspondence that it was made from."""
-
-    vertices: Tensor
-    """``[b, n_target, 3]``, the output."""
-    warped: Tensor
-    """``[b, n_target, 3]``, the source's vertices moved by `transport`, before the refinement."""
-    transport: Tensor
-    """``[b, n_target, n_source]``, transport matrix with rows divided by their sums."""
 
 
 class CoreNet3D(nn.Module):
@@ -85,9 +74,8 @@ class CoreNet3D(nn.Module):
 
     Memory: the matrix K between n and m vertices is held once for the pair at work if it has at most 8,192^2 elements
     (256 MiB), else not at all; at 28,920 vertices each, where it would take 3.1 GiB, its blocks are computed anew in
-    every pass, forward and backward, and inference adds 1.2 GiB in all (42 s on one core). The correspondence on
-    request holds it twice, and compiled or exported forms hold it too: 6.2 GiB a pair there, and a memory error of
-    PyTorch's where there is less.
+    every pass, forward and backward, and inference adds 1.2 GiB in all (42 s on one core). Compiled and exported
+    forms hold it twice: 6.2 GiB a pair there, and a memory error of PyTorch's where there is less.
 
     Examples
     --------
@@ -127,25 +115,11 @@ class CoreNet3D(nn.Module):
         identity, theta, phi, masses = self._described(source, target)
         with full_precision(source):
             warped = warp(theta, phi, source, identity.masses, masses)
-        return self._refined(warped, identity)
+        return with_zero_gradients(self.generator(warped, identity), self.features.dead_biases())
 
     def accumulation(self) -> AbstractContextManager[None]:
         """Iterate the spectral norms once, then never while the block runs: for the parts of one training step."""
         return iterated_once(self)
-
-    def forward_with_correspondence(self, *, source: Tensor, target: Tensor) -> Transfer:
-        """Return the same with the warped points and the transport matrix, which is held (twice) in memory.
-
-        Raises
-        ------
-        ValueError
-            If shapes or dtypes do not fit.
-        """
-        identity, theta, phi, masses = self._described(source, target)
-        with full_precision(source):
-            transport = transport_matrix(theta, phi, identity.masses, masses)
-            warped = transport @ source
-        return Transfer(self._refined(warped, identity), warped, transport)
 
     def _described(self, source: Tensor, target: Tensor) -> tuple[Identity, Tensor, Tensor, Tensor | None]:
         """Return the target's features, both meshes' features of unit length, and the masses of the source."""
@@ -155,9 +129,6 @@ class CoreNet3D(nn.Module):
             identity = self.features(target, targets)
             theta, phi = self.theta(identity), self.phi(self.features(source, sources))
             return Identity.of(identity, targets), unit_length(theta), unit_length(phi), sources
-
-    def _refined(self, warped: Tensor, identity: Identity) -> Tensor:
-        return with_zero_gradients(self.generator(warped, identity), self.features.dead_biases())
 
 
 class VertexFeatures(nn.Module):

@@ -37,15 +37,6 @@ from torch import Tensor
 
 from training.objectives.losses import SHORTEST_EDGE
 
-POINT_MESH_DISTANCE_SCALE = 1e-4
-"""Tables print PMD in units of this."""
-
-CHAMFER_DISTANCE_SCALE = 1e-4
-"""Tables print CD in units of this."""
-
-EARTH_MOVER_DISTANCE_SCALE = 1e-3
-"""Tables print EMD in units of this."""
-
 EARTH_MOVER_POINTS = 1024
 """Vertices of which the EMD is taken by default: an exact assignment takes time in up to the cube of this."""
 
@@ -58,8 +49,7 @@ _SOFTNESS, _ROUNDS, _TINY = 0.02, 40, np.float32(1e-30)
 def point_mesh_distance(prediction: Tensor, truth: Tensor) -> Tensor:
     """Return PMD, the mean over vertices *and coordinates* of ``(prediction - truth)^2``, in box^2.
 
-    The paper calls it a Euclidean distance (section 4.2); its code and its numbers are this. Tables print it in units
-    of `POINT_MESH_DISTANCE_SCALE`.
+    The paper calls it a Euclidean distance (section 4.2); its code and its numbers are this.
 
     Parameters
     ----------
@@ -111,8 +101,8 @@ def mean_euclidean_error(prediction: Tensor, truth: Tensor) -> Tensor:
 def chamfer_distance(prediction: Tensor, truth: Tensor) -> Tensor:
     """Return CD, mean squared distance to the nearest vertex, prediction to truth plus truth to prediction, in box^2.
 
-    ``CD = mean_p min_t |p - t|^2 + mean_t min_p |p - t|^2`` (section 4.2), exact; tables print it in units of
-    `CHAMFER_DISTANCE_SCALE`. The two meshes may differ in their number of vertices.
+    ``CD = mean_p min_t |p - t|^2 + mean_t min_p |p - t|^2`` (section 4.2), exact. The two meshes may differ in
+    their number of vertices.
 
     Nearest vertices come from k-d trees on the CPU, for meshes on a GPU too: n log n time and memory in proportion to
     n, where a table of all float64 distances between two meshes of 28,920 vertices would take 6.7 GB, and blocks of it
@@ -134,7 +124,7 @@ def earth_mover_distance(
 ) -> Tensor:
     """Return EMD, the mean distance (box) under the best one-to-one assignment: ``min_s mean_i |p_i - t_s(i)|``.
 
-    Section 4.2; tables print it in units of `EARTH_MOVER_DISTANCE_SCALE`. Exact (SciPy's shortest augmenting paths), on
+    Section 4.2. Exact (SciPy's shortest augmenting paths), on
     the same ``min(points, n)`` vertices of both, drawn by `seed` without replacement. Over all vertices
     ``EMD <= sqrt(3 PMD)``; over fewer the same with the PMD of those. EMD grows as the points thin out, since a vertex
     then finds its nearest partners missing: compare figures of one number of points only.

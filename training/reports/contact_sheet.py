@@ -4,15 +4,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
-from datagen.common.arrays import Floats
 from datagen.grid import POSE_TYPES, SPLITS, Grid
-from datagen.mesh.geometry import bounding_box
+from datagen.mesh.geometry import Mesh
 from datagen.mesh.parts import part_colors
 from datagen.store import Dataset
-from training.viz.mesh_grid import contact_sheet
+from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 
-_ROWS, _COLUMNS = 6, 8
+_HUES = ("#5B8CD1", "#E8995A", "#55A98F", "#B98BC6", "#D0AE48", "#CE7474")
+_ROWS, _COLUMNS = len(_HUES), 8
 
 
 def draw_contact_sheet(dataset: Dataset, path: Path) -> Path:
@@ -23,13 +24,12 @@ def draw_contact_sheet(dataset: Dataset, path: Path) -> Path:
     """
     grid = dataset.grid
     rows, columns = chosen(identity_groups(grid), _ROWS), chosen(pose_groups(grid), _COLUMNS)
-    meshes = [_row(dataset, identity, columns) for identity in rows]
     before = grid.steps[0].training + grid.steps[0].evaluation, grid.steps[0].seen + grid.steps[0].unseen
-    labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}" for i in rows]
     headings = [f"pose {p}\n{grid.pose_type(p)}{_appended(p, before[1])}" for p in columns]
-    parts = [dataset.part(identity) for identity in rows]
-    colors = [None if part is None else part_colors(part) / 255 for part in parts]
-    return contact_sheet(meshes, [dataset.faces(i) for i in rows], labels, headings, path, colors_per_row=colors)
+    labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}".replace(", ", ",\n") for i in rows]
+    title = f"{len(rows)} of {grid.identity_count:,} identities in {len(columns)} of {grid.pose_count:,} poses"
+    page = [Row(label, _panels(dataset, i, columns, hue)) for label, i, hue in zip(labels, rows, _HUES, strict=False)]
+    return mesh_grid(page, path, columns=headings, title=title)
 
 
 def identity_groups(grid: Grid) -> list[range]:
@@ -67,11 +67,15 @@ def _spread(count: int, wanted: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, wanted).astype(int)).tolist()
 
 
-def _row(dataset: Dataset, identity: int, poses: list[int]) -> list[Floats | None]:
-    """The meshes of an identity, None where the dataset has none."""
+def _panels(dataset: Dataset, identity: int, poses: list[int], hue: str) -> list[Panel | str]:
+    """The meshes of an identity, words where the dataset has none."""
     there = set(dataset.grid.poses_of(identity).tolist())
     meshes = dict(zip(held := [pose for pose in poses if pose in there], dataset.vertices(identity, held), strict=True))
-    return [meshes[pose] - bounding_box(meshes[pose]).centre if pose in there else None for pose in poses]
+    faces, part = dataset.faces(identity), dataset.part(identity)
+    colors = to_rgb(hue) if part is None else part_colors(part) / 255
+    return [
+        Panel(Mesh(standing(meshes[pose]), faces), colors) if pose in there else "not in the dataset" for pose in poses
+    ]
 
 
 def _appended(number: int, before: int) -> str:

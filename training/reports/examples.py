@@ -16,6 +16,7 @@ from training.data.batch import read_batch
 from training.evaluation.evaluate import POSE_TYPES, Row, evaluation_list
 from training.inference.mesh_reading import takes_surfaces
 from training.inference.predict import predict
+from training.objectives import PMD_UNIT
 from training.recipes.training import EvaluationRecipe
 from training.viz.comparison_figure import comparison_figure
 from training.viz.transfer_example import Comparison
@@ -104,7 +105,7 @@ def _comparison(
 
 
 def _words(row: Row) -> str:
-    return f"PMD {row.pmd * 1e4:.1f}e-4, {row.millimetres:.0f} mm"
+    return f"PMD {row.pmd / PMD_UNIT:.1f}e-4, {row.millimetres:.0f} mm"
 
 
 def _file_name(name: str) -> str:

@@ -18,6 +18,7 @@ from training.evaluation.evaluate import Row, read_rows
 from training.evaluation.measure import CONTROLS
 from training.evaluation.tables import about_weights, mean_of, methods_of, results
 from training.inference.projection import PROJECTED
+from training.objectives import PMD_UNIT
 from training.recipes.training import EvaluationRecipe
 from training.reports.blocks import Block, Code, EmbeddedPage, Facts, Picture, Section, shown
 from training.reports.card_texts import NETWORKS, span, vertex_counts
@@ -208,7 +209,7 @@ def _lead(runs: Mapping[str, Path], dataset: Dataset, rows: list[Row]) -> str:
         f"{NETWORKS[network]}, {checkpoint.step:,} steps on {len(grid.identities('training'))} identities in "
         f"{len(grid.poses('seen')):,} poses. "
     )
-    scores = {each: mean_of(rows, method=each, pose_type=kind, field="pmd") * 1e4 for each in methods_of(rows)}
+    scores = {each: mean_of(rows, method=each, pose_type=kind, field="pmd") / PMD_UNIT for each in methods_of(rows)}
     others = ", ".join(f"{plain(each)} {score:.2f}" for each, score in scores.items() if each not in runs)
     beside = "".join(f" Beside it, {plain(each)}: **{scores[each]:.2f}**." for each in runs if each != method)
     error = mean_of(rows, method=method, pose_type=kind, field="millimetres")

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any
 
+from training.objectives import PMD_UNIT
+
 _INTERVALS = 50  # between journal rows, that the recent rate is taken from
 _RESTART_SECONDS, _RESTART_FACTOR = 30.0, 10.0  # a pause as long is a restart, and says nothing of the rate
 _LEFT_OUT_FIRST = ("meshes", "best", "epoch", "wait", "loss", "pmd")
@@ -45,10 +47,10 @@ def progress_line(
         "epoch": f"epoch {epoch}/{math.ceil(steps / steps_per_epoch)}" if steps_per_epoch else "",
         "step": f"step {step:,}/{steps:,}",
         "loss": _said("loss {:.4g}", row.get("loss/total")),
-        "pmd": _said("PMD unseen {:.1f}e-4", None if pmd is None else pmd * 1e4),
+        "pmd": _said("PMD unseen {:.1f}e-4", None if pmd is None else pmd / PMD_UNIT),
         "plane": _said("{:.1f} mm to the plane", row.get("evaluation/plane_unseen")),
         "iou": _said("IoU {:.2f}", row.get("evaluation/iou_unseen")),
-        "best": f"best {best * 1e4:.1f}e-4" if pmd is not None and best is not None and best < pmd else "",
+        "best": f"best {best / PMD_UNIT:.1f}e-4" if pmd is not None and best is not None and best < pmd else "",
         "meshes": _said("{:,.0f} meshes/s", row.get("meshes_per_second")),
         "wait": f"input wait {wait:.0%}" if wait > 0.02 else "",
         "left": f"{duration(seconds_left)} left" if seconds_left is not None and step < steps else "",

@@ -9,70 +9,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.colors import to_rgb
 
-from datagen.common.arrays import Floats, Integers
+from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.page import Page
 from training.viz.render.camera import Camera, frame
 from training.viz.render.renderer import render_mesh
 from training.viz.style import PAGE, QUIET, saved
-
-_SHEET_HUES = ("#5B8CD1", "#E8995A", "#55A98F", "#B98BC6", "#D0AE48", "#CE7474")
-
-
-def contact_sheet(
-    grid: Sequence[Sequence[Floats | None]],
-    faces_per_row: Sequence[Integers],
-    row_labels: Sequence[str],
-    column_labels: Sequence[str],
-    path: str | os.PathLike[str],
-    *,
-    colors_per_row: Sequence[npt.ArrayLike | None] | None = None,
-    panel: tuple[int, int] = (210, 250),
-) -> Path:
-    """Draw a grid of meshes, identities down and poses across, all on one scale.
-
-    Parameters
-    ----------
-    grid : rows of arrays [v, 3]
-        Vertices, Y up, facing +Z; rows may differ in vertex count. None where there is no such mesh.
-    faces_per_row : arrays [f, 3]
-        The triangles of each row.
-    row_labels, column_labels : sequence of str
-    path : path of the PNG to write
-    colors_per_row : sequence of arrays [v, 3] in 0..1, or None
-        sRGB of each row's vertices; None where the row has a hue of its own.
-    panel : (int, int)
-        Width and height of a panel in pixels.
-    """
-    colors = list(colors_per_row or [None] * len(grid))
-    if not len(grid) == len(faces_per_row) == len(row_labels) == len(colors) or any(
-        len(row) != len(column_labels) for row in grid
-    ):
-        raise ValueError("grid, faces_per_row, row_labels, column_labels and colors_per_row differ in length")
-    stood = [[None if one is None else standing(np.asarray(one, float)) for one in row] for row in grid]
-    solid = [
-        Mesh(one, faces) for row, faces in zip(stood, faces_per_row, strict=True) for one in row if one is not None
-    ]
-    camera = frame(solid, size=panel)
-    page = Page(width=90 + len(column_labels) * panel[0], height=70 + len(grid) * panel[1] + 20)
-    for column, label in enumerate(column_labels):
-        page.text(70 + (column + 0.5) * panel[0], 40, label, size=7.5, anchor="center", weight="bold")
-    for index, (row, faces) in enumerate(zip(stood, faces_per_row, strict=True)):
-        top = 70 + index * panel[1]
-        page.text(38, top + panel[1] / 2, row_labels[index], size=7.5, anchor="center", rotation=90, weight="bold")
-        own = colors[index]
-        hue = to_rgb(_SHEET_HUES[index % len(_SHEET_HUES)]) if own is None else own
-        for column, vertices in enumerate(row):
-            if vertices is None:
-                middle = 70 + (column + 0.5) * panel[0], top + panel[1] / 2
-                page.text(*middle, "not in the dataset", size=6.5, color=QUIET, anchor="center")
-                continue
-            picture = render_mesh(vertices, faces, colors=hue, camera=camera, size=panel, background=PAGE)
-            page.picture(picture, 70 + column * panel[0], top)
-    return saved(page.figure, path)
-
 
 _LABELS, _HEADINGS, _LINE, _CAPTION, _EDGE = 156, 56, 30, 26, 16  # pixels
 _LETTER = 11.2  # width of a letter of the title

@@ -10,6 +10,9 @@ from datagen.mesh.geometry import Mesh, standing_point
 from training.viz.look import Look
 from training.viz.render.camera import Camera, azimuth_of, frame
 
+PANEL = (480, 560)
+"""Pixels of a panel of a picture of one transfer without a known truth."""
+
 _REACH = 0.2  # of the right shape's box: what an output may reach beyond it and still be framed
 
 
@@ -54,6 +57,22 @@ class Motion:
 
     frames: Sequence[tuple[Mesh, Mesh]]
     rate: float
+
+
+@dataclass(frozen=True)
+class NamedMesh(Mesh):
+    """A mesh, Y up and facing +Z, what the page calls it, and what its faces look like in its file."""
+
+    name: str
+    look: Look | None = None
+
+
+def shown(
+    source: NamedMesh, target: NamedMesh, output: NamedMesh, *, motion: Motion | None = None, title: str = ""
+) -> Comparison:
+    """One transfer without a known truth, as figures and viewer take it; ``motion``: the frames that it begins."""
+    title = title or f"{target.name} in the pose of {source.name}"
+    return Comparison(title=title, source=source, target=target, outputs={"Output": output}, motion=motion)
 
 
 ERROR_UNIT = "cm"
@@ -153,8 +172,7 @@ def placed_frames(comparison: Comparison) -> Iterator[tuple[Mesh, Mesh]]:
 
 def look_at(mesh: Mesh) -> Look | None:
     """Return what the faces of a mesh look like by themselves, where it says so."""
-    look = getattr(mesh, "look", None)
-    return look if isinstance(look, Look) else None
+    return mesh.look if isinstance(mesh, NamedMesh) else None
 
 
 def _stood(mesh: Mesh, name: str, right: Mesh | None, *, moves_with: Mesh | None) -> Floats:

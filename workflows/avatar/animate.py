@@ -13,6 +13,7 @@ from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import read_mesh_file
 from datagen.mesh.formats.glb_export import built_draft
 from datagen.mesh.formats.surface import Material, Surface
+from datagen.mesh.geometry import Mesh
 from datagen.mesh.limits import FRAME_LIMIT
 from datagen.mesh.sequences import frames_of
 from datagen.poses import Poses, draw_poses
@@ -20,7 +21,7 @@ from datagen.poses.pose_files import read_pose_file
 from datagen.recipe import PoseRecipe
 from training.avatar.subject import posed_by
 from training.inference.pose_reading import read_poses
-from training.viz.mesh_grid import contact_sheet
+from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 from workflows.avatar.evaluate import learned_avatar, require_avatar
 from workflows.avatar.recipe import load_avatar
 from workflows.pipeline.progress import bar
@@ -70,23 +71,24 @@ def animate(
         )
     transforms = posed_by(subject.body, poses.rotations, poses.joints, poses.parents)
     kept = set(np.linspace(0, len(poses) - 1, _SHOWN).astype(int).tolist())
-    shown = list[NDArray[np.float64]]()
+    shown = dict[int, NDArray[np.float64]]()
 
     def frames() -> Iterator[NDArray[np.float64]]:
         posed = wardrobe.animated(network, number, transforms)
         for frame, its in enumerate(bar(posed, total=len(poses), what="animate", unit="frame")):
+            vertices = np.asarray(its.mesh.vertices, np.float64)
             if frame in kept:
-                shown.append(np.asarray(its.mesh.vertices, np.float64))
-            yield np.asarray(its.mesh.vertices, np.float64)
+                shown[frame] = vertices
+            yield vertices
 
     count = len(wardrobe.templates[number].vertices)
     draft, _ = built_draft(_surface(faces, subject.name), count, subject.name)
     draft.animated(frames(), out, frames_per_second=frames_per_second)
     if picture:
-        half = (len(shown) + 1) // 2
-        rows: list[list[NDArray[np.float64] | None]] = [[*shown[:half]], [*shown[half:]]]
-        rows[1] += [None] * (2 * half - len(shown))
-        contact_sheet(rows, [faces] * 2, ["", ""], [""] * half, picture, colors_per_row=[to_rgb(_COLOR)] * 2)
+        panels = [Panel(Mesh(standing(shown[place]), faces), to_rgb(_COLOR), f"frame {place}") for place in shown]
+        half = (len(panels) + 1) // 2
+        rows = [Row("", panels[start : start + half]) for start in range(0, len(panels), half)]
+        mesh_grid(rows, picture, columns=[""] * half, title=subject.name)
 
 
 def poses_of(folder: AvatarFolder, file: Path | None, source: Path | None = None, *, count: int, seed: int) -> Poses:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 from datagen.common.errors import RecipeError
 from datagen.common.files import read_text_within
@@ -27,10 +27,10 @@ from workflows.pipeline.console import at_work, print_text
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
     from workflows.pipeline.run_folder import TrialsFolder
+    from workflows.studies.comparison.plan import ComparisonKind
     from workflows.studies.sweep.report import TrialResult
 
-ComparisonKind = Literal["comparison", "ablation"]
-_NAMES: dict[ComparisonKind, str] = {"comparison": "compare", "ablation": "ablation"}
+_NAMES: "dict[ComparisonKind, str]" = {"comparison": "compare", "ablation": "ablation"}
 
 
 def _trials_options(made: Parser, one: str) -> None:
@@ -69,7 +69,7 @@ def _shown(out: Path) -> Path:
     return Path(os.path.relpath(out)) if out.is_relative_to(Path.cwd()) else out
 
 
-def _comparison_options(made: Parser, kind: ComparisonKind) -> None:
+def _comparison_options(made: Parser, kind: "ComparisonKind") -> None:
     from workflows.studies.comparison.plan import known_comparisons
 
     add, names = made.add_argument, ", ".join(known_comparisons(kind))
@@ -98,7 +98,7 @@ def ablation_command(options: argparse.Namespace) -> None:
     _compare(options, "ablation")
 
 
-def _compare(options: argparse.Namespace, kind: ComparisonKind) -> None:
+def _compare(options: argparse.Namespace, kind: "ComparisonKind") -> None:
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.studies.comparison.plan import plan_comparison
     from workflows.studies.comparison.run import folder_of, run_comparison
@@ -111,7 +111,7 @@ def _compare(options: argparse.Namespace, kind: ComparisonKind) -> None:
         print_text(_comparison_words(out, server))
 
 
-def _command_line(options: argparse.Namespace, kind: ComparisonKind) -> str:
+def _command_line(options: argparse.Namespace, kind: "ComparisonKind") -> str:
     """The command that does the same again."""
     words = ["dsffnet", _NAMES[kind], "--recipe", options.recipe]
     words += ["--set", *options.set] if options.set else []
@@ -147,10 +147,6 @@ def _sweep_options(made: Parser) -> None:
     )  # fmt: skip
     sweeps = ", ".join(known_sweeps())
     add("--trials", metavar="NAME|FILE", help=f"a YAML list of trials {{name, description, set}}, or one of {sweeps}")
-    add(
-        "--reach", nargs="+", default=["2x"], metavar="LEVEL",
-        help="PMD whose first reaching is reported: 2x for twice the best final one (default), 40 for 40e-4",
-    )  # fmt: skip
     add("--strict", action="store_true", help="exit status 1 if any trial failed, not only if all did")
     _trials_options(made, "trial")
 
@@ -164,13 +160,11 @@ def sweep_command(options: argparse.Namespace) -> None:
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.run_folder import SweepFolder
     from workflows.studies.sweep.plan import plan_sweep
-    from workflows.studies.sweep.report import parse_levels
     from workflows.studies.sweep.run import Settings, run_sweep
 
     sweep = plan_sweep(recipe=options.recipe, shared=options.set, vary=options.vary, trials=options.trials)
     name = options.name or (Path(options.trials).stem if options.trials else "sweep")
-    levels = parse_levels(options.reach)
-    settings = Settings(name, levels, options.cpus_per_trial, options.gpus_per_trial, options.strict)
+    settings = Settings(name, options.cpus_per_trial, options.gpus_per_trial, options.strict)
     out = Path(require_reachable(options.out or f"runs/{name}", option="--out"))
     with _at_work(options, SweepFolder(out), sweep.recipe.data) as server:
         run_sweep(sweep, out, settings, show=lambda results: print_text(_sweep_words(results, out, server)))
@@ -232,14 +226,12 @@ def robustness_command(options: argparse.Namespace) -> None:
 
 
 def _generalisation_options(made: Parser) -> None:
-    from datagen.recipe import AnnyTopology
     from workflows.studies.sizes import OTHERS, TOPOLOGIES, Sizes
 
     _weights_options(made)
     sizes, add = Sizes(), made.add_argument
-    known = tuple(topology for topology in get_args(AnnyTopology) if topology != "makehuman")
     add(
-        "--topologies", nargs="+", choices=known, default=list(TOPOLOGIES), metavar="NAME",
+        "--topologies", nargs="+", choices=TOPOLOGIES, default=list(TOPOLOGIES), metavar="NAME",
         help=f"Anny's meshes to make (default: all of {', '.join(TOPOLOGIES)})",
     )  # fmt: skip
     add(

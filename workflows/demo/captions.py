@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from datagen.common.arrays import Floats
 from datagen.common.printable import printable
 from datagen.mesh.geometries import CHOOSE
-from training.objectives.metrics import POINT_MESH_DISTANCE_SCALE
+from training.objectives import PMD_UNIT
 from training.viz.style import ERROR_COLORS, ROLE_COLORS
 from workflows.demo.transfers import Outcome, Posed
 
@@ -55,7 +55,7 @@ def dressed_colors(role: str, garments: NDArray[np.integer] | None) -> Floats | 
 def label(outcome: Outcome, frame: Posed) -> str:
     """What stands behind the result's label."""
     if frame.pmd is not None:
-        return f"PMD {frame.pmd / POINT_MESH_DISTANCE_SCALE:.2f}e-4"
+        return f"PMD {frame.pmd / PMD_UNIT:.2f}e-4"
     return "draping the truth …" if outcome.asked.draped and outcome.waits_for_draping else ""
 
 

@@ -19,6 +19,7 @@ from training.engine.launch import launch
 from training.engine.resume import require_same_training
 from training.evaluation.document import plain
 from training.inference.domain_check import noted, seen_in
+from training.objectives import PMD_UNIT
 from training.recipes.training import NetworkRecipe, TrainingRecipe
 from training.reports.plots.training_curve import draw_coefficients, draw_training_curve
 from training.tracking.journal import read_journal
@@ -123,7 +124,7 @@ def about_model(network: NetworkRecipe, step: int, dataset: Dataset, pmd: Mappin
     """Weights in two paragraphs of markup: on what they were trained, and their PMD by pose type."""
     people, poses = len(dataset.identities("training")), len(dataset.grid.poses("seen"))
     name = plain(PurePosixPath(dataset.url).name)
-    scores = ", ".join(f"{value * 1e4:.2f}e-4 in {pose_type} poses" for pose_type, value in pmd.items())
+    scores = ", ".join(f"{value / PMD_UNIT:.2f}e-4 in {pose_type} poses" for pose_type, value in pmd.items())
     return (
         f"{plain(network.title)}, step {step:,} of a training on {name}: {dataset.recipe.body.family} "
         f"bodies, {people:,} identities in {poses:,} poses ({dataset.uuid}).\n\n"

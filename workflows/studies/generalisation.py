@@ -17,6 +17,7 @@ from training.evaluation.generalisation import (
     pairs_with_truth,
 )
 from training.evaluation.robustness import NO_OP, Case, methods_in
+from training.objectives import PMD_UNIT
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 from workflows.pipeline.progress import bar
 from workflows.pipeline.ray_cluster import require_reachable
@@ -78,7 +79,7 @@ class GeneralisationStudy(Study[GeneralisationRow]):
         for row in rows:
             if row.method != NO_OP:
                 where = "within" if row.source_kind == row.target_kind else "between"
-                values.setdefault(f"pmd/{where}/{metric_name(row.method)}", []).append(row.pmd * 1e4)
+                values.setdefault(f"pmd/{where}/{metric_name(row.method)}", []).append(row.pmd / PMD_UNIT)
         return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
 
     def report(self, rows: list[GeneralisationRow]) -> str:
@@ -163,5 +164,5 @@ def _in_lines(name: str) -> str:
 
 
 def _grids(rows: Sequence[GeneralisationRow], kinds: Sequence[str], method: str) -> list[Text | Table]:
-    metres = grid_table(rows, kinds, method, field="millimetres", factor=1)
+    metres = grid_table(rows, kinds, method, field="millimetres", unit=1)
     return [Text(f"## {plain(method)}\n\nPMD x1e-4"), grid_table(rows, kinds, method), Text("mm"), metres]

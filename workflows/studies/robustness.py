@@ -22,6 +22,7 @@ from training.evaluation.robustness import (
     refusal,
     steps,
 )
+from training.objectives import PMD_UNIT
 from training.reports.plots.robustness import (
     disturbance_picture,
     millimetres,
@@ -90,7 +91,7 @@ class RobustnessStudy(Study[RobustnessRow]):
             for method in self.methods
             for disturbance in DISTURBANCES
         }
-        return {name: levels[-1].mean * 1e4 for name, levels in curves.items() if levels}
+        return {name: levels[-1].mean / PMD_UNIT for name, levels in curves.items() if levels}
 
     def report(self, rows: list[RobustnessRow]) -> str:
         """What was done, where it breaks, every number."""
@@ -100,7 +101,7 @@ class RobustnessStudy(Study[RobustnessRow]):
             f"Weights: {trained}. Dataset {plain(self.data)}, its first {len(self.cases)} "
             "evaluation triples of new identities. Only the source is changed, before its normalisation; ground truth "
             "and target stay. PMD: mean over vertices and coordinates of (output - truth)^2 in the normalised box, "
-            f"times 1e4. Undisturbed: {start}; returning the target unchanged: {no_op(rows) * 1e4:.2f}. Amounts "
+            f"times 1e4. Undisturbed: {start}; returning the target unchanged: {no_op(rows) / PMD_UNIT:.2f}. Amounts "
             f"in half box edges: 0.01 is {millimetres(0.01):.1f} mm on a body of 1.7 m."
         )
         left_out = Text("".join(_left_out(method, self.disturbances) for method in self.methods))
@@ -133,4 +134,4 @@ def _left_out(method: LoadedMethod, disturbances: Sequence[Disturbance]) -> str:
 
 def _undisturbed(rows: Sequence[RobustnessRow], method: LoadedMethod) -> float:
     levels = [curve(rows, method.name, disturbance.name) for disturbance in DISTURBANCES]
-    return next(curve_levels[0].mean * 1e4 for curve_levels in levels if curve_levels)
+    return next(curve_levels[0].mean / PMD_UNIT for curve_levels in levels if curve_levels)

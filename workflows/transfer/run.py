@@ -29,8 +29,7 @@ from workflows.transfer.job import TransferJob
 
 if TYPE_CHECKING:
     from training.viz.look import Look
-    from training.viz.transfer_example import Comparison
-    from training.viz.transfer_picture import NamedMesh
+    from training.viz.transfer_example import Comparison, NamedMesh
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
 _VOTING_FRAMES = 3  # of a sequence, on how it stands
@@ -237,7 +236,7 @@ class TransferWork:
 
     def _draw(self) -> None:
         from training.viz.comparison_figure import comparison_figure
-        from training.viz.transfer_picture import PANEL, shown
+        from training.viz.transfer_example import PANEL, shown
         from training.viz.viewer import write_viewer
 
         job, target = self.job, self._upright_target(self.target.mesh, self.job.target)
@@ -257,8 +256,7 @@ class TransferWork:
 
     def _sequence(self, target: "NamedMesh") -> "Comparison":
         """All frames that the page plays, as one transfer that moves."""
-        from training.viz.transfer_example import Motion
-        from training.viz.transfer_picture import shown
+        from training.viz.transfer_example import Motion, shown
 
         frames = [
             (self._upright_source(number), self._upright_target(posed, self._place(number)))
@@ -293,9 +291,7 @@ class TransferWork:
 
 
 def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None") -> "NamedMesh":
-    from training.viz.transfer_picture import (
-        NamedMesh,  # it brings matplotlib, which a transfer does not need otherwise
-    )
+    from training.viz.transfer_example import NamedMesh  # it brings matplotlib, which a transfer needs only here
 
     fits = look is not None and look.fits(len(mesh.vertices), len(mesh.faces))
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name, look if fits else None)

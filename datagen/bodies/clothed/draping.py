@@ -59,8 +59,7 @@ class Cloth:
     """A garment ready to be draped over a body whose faces are ``faces`` [face, 3]."""
 
     def __init__(self, garment: Garment, worn_by: Rest, faces: NDArray[np.int64]) -> None:
-        self._garment, body = garment, worn_by.vertices.astype(np.float32)
-        vertices = garment.rest.vertices
+        body, vertices = worn_by.vertices.astype(np.float32), garment.rest.vertices
         self._edges, self._bends = _springs(garment)
         self._mesh = wp.Mesh(points=_vectors(body), indices=_integers(faces.ravel()))
         self._pins = _pins(garment, worn_by, faces)

@@ -19,7 +19,7 @@ from datagen.bodies.skinning import Rest, skin
 from datagen.characters.weld import first_of_equals
 from datagen.common.errors import BodyError, MeshError
 from datagen.mesh.files import read_mesh_file
-from datagen.mesh.geometry import closest_on_triangle
+from datagen.mesh.geometry import closest_on_triangle, triangles_of
 from datagen.mesh.rig import part_transforms
 from datagen.recipe import GarmentFile
 
@@ -118,7 +118,7 @@ def fit(recipe: GarmentFile, wearer: Wearer, *, where: str, most_subdivided: int
     name = f"{Path(recipe.path).name or 'no file'} ({where})"
     places, faces = _read(recipe, name)
     _require_garment(places, faces, name, most_subdivided)
-    group = _triangles(recipe.follows)
+    group = triangles_of(helper_quads()[recipe.follows])
     _require_size(places, wearer.posed[np.unique(group)], name)
     faces = faces if _looks_outwards(places, faces, wearer.posed, group) else faces[:, ::-1]
     on = _nearest(places, faces, wearer.posed, group)
@@ -185,11 +185,6 @@ def _require_size(places: NDArray[np.float64], body: NDArray[np.float64], name: 
         f"{name} is {size:.3g} m across, where garments have {_SIZES[0]:g} to {_SIZES[1]:g} m. If it is in "
         f"{_UNITS[factor]}, say unit: {factor:g}"
     )
-
-
-def _triangles(group: str) -> NDArray[np.int64]:
-    quads = helper_quads()[group]
-    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def _normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from datagen.bodies.clothed.fitting import FittedGarment, Wearer, fit
 from datagen.bodies.clothed.garments import Garment, Part, covered, garment_of
 from datagen.bodies.skinning import Rest, rig_of, skin
 from datagen.common.assets import Asset, file_asset
+from datagen.mesh.geometry import triangles_of
 from datagen.mesh.rig import Rig, drivers_of, part_transforms
 from datagen.poses import JOINTS, PARENTS, Poses
 from datagen.recipe import AnnyBody, ClothedBody, GarmentFile
@@ -184,5 +185,4 @@ def _some(rest: Rest, vertices: NDArray[np.int64]) -> Rest:
 @lru_cache(maxsize=1)
 def body_faces() -> NDArray[np.int64]:
     """Triangles [face, 3] of MakeHuman's body."""
-    quads = helper_quads()["body"]
-    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return triangles_of(helper_quads()["body"])

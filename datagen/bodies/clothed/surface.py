@@ -7,6 +7,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from datagen.mesh.geometry import triangles_of
+
 Matrix: TypeAlias = scipy.sparse.csr_array
 _SNAP = 0.35  # of an edge: a cut that passes nearer to a vertex moves the vertex instead, so that no slivers appear
 
@@ -52,9 +54,7 @@ class Worn:
 
 def surface_of(quads: NDArray[np.int64], sources: int) -> Surface:
     """The surface of quads [quad, 4] that index ``sources`` vertices, each split along its first diagonal."""
-    whole = Surface(
-        np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), scipy.sparse.eye_array(sources, format="csr")
-    )
+    whole = Surface(triangles_of(quads), scipy.sparse.eye_array(sources, format="csr"))
     return whole.keep(np.ones(len(whole.faces), bool))
 
 

@@ -97,16 +97,6 @@ def test_characters_without_a_common_joint_are_refused(folder: Path) -> None:
         model(folder)
 
 
-def test_a_batch_gives_what_single_poses_give_to_the_bit(folder: Path) -> None:
-    body, names = model(folder), tuple(JOINTS)
-    random = np.random.default_rng(0)
-    poses = Poses(names, bent("Spine", 0).parents, random.normal(scale=0.5, size=(40, len(names), 3)))
-    batch = body.vertices(identity(body, 1), poses)
-    assert batch.dtype == np.float32
-    for row in (0, 17, 39):
-        assert np.array_equal(batch[row], body.vertices(identity(body, 1), poses[row : row + 1])[0])
-
-
 def test_a_bent_hip_carries_the_foot_and_nothing_else(folder: Path) -> None:
     """A positive turn about x swings what hangs down backwards."""
     body = model(folder, bone_scale=0.0, characters=["person"])

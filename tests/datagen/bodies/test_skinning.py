@@ -15,6 +15,7 @@ from datagen.bodies.skinning import Rest, remembering, skin
 from datagen.common.seeding import Stream, generator
 from datagen.poses import draw_poses
 from datagen.recipe import AnnyBody, LegBody, PoseRecipe
+from tests.support.shapes.bodies import OLD_CPU
 
 PARENTS = (-1, 0, 1, 1)
 
@@ -106,14 +107,8 @@ def digest() -> str:
 
 def test_an_older_cpu_gives_the_same_bytes() -> None:
     """OpenBLAS, NumPy and PyTorch restricted to what a CPU of 2008 can do, against this machine's own best."""
-    old = {
-        "OPENBLAS_CORETYPE": "Nehalem",
-        "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX",
-        "ATEN_CPU_CAPABILITY": "default",
-        "MKL_CBWR": "COMPATIBLE",
-        "OMP_NUM_THREADS": "2",
-    }
     words = [sys.executable, "-c", "from tests.datagen.bodies import test_skinning; print(test_skinning.digest())"]
     root = Path(__file__).parents[3]
-    done = subprocess.run(words, env={**os.environ, **old}, cwd=root, capture_output=True, text=True, check=True)
+    old = {**os.environ, **OLD_CPU, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(words, env=old, cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout.split()[-1] == digest()

@@ -79,7 +79,7 @@ def test_a_task_makes_several_small_shards_and_each_once(tmp_path: Path, monkeyp
     monkeypatch.setattr(shards, "_FEWEST_TASKS", 4)
     made = generate(broad(600), str(tmp_path / "x.zarr"), run=run)
     wanted = [shard.place for (some,) in run.of("ensure_shards") for shard, _ in some]
-    assert wanted == [row.place for row in made.manifest] and len(wanted) == 60
+    assert wanted == [row.place for row in made.committed.shards] and len(wanted) == 60
     assert 4 <= len(run.of("ensure_shards")) <= 5
     objects = sum(path.is_file() for path in (tmp_path / "x.zarr").rglob("*"))
     assert objects <= 1.1 * 60 + 100
@@ -215,7 +215,7 @@ def test_a_shard_that_shrank_since_is_made_again_and_one_of_its_size_is_found_by
     url = tmp_path / "leg.zarr"
     with pytest.raises(KeyboardInterrupt):
         generate(tiny_dataset(), str(url), run=Watched(stop_after=3))
-    first, second = (url / row.path for row in open_dataset(dataset).manifest[:2])
+    first, second = (url / row.path for row in open_dataset(dataset).committed.shards[:2])
     first.write_bytes(first.read_bytes()[:-9])
     flip_bit(second)
     generate(tiny_dataset(), str(url))
@@ -225,7 +225,7 @@ def test_a_shard_that_shrank_since_is_made_again_and_one_of_its_size_is_found_by
 def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, described, asked = Watched(), list[int](), list[str]()
     real, sizes, leftovers = identities.identity_parameters, writer.stored_sizes, writer.list_leftovers
-    there = {row.path for row in open_dataset(str(spoilable)).manifest}
+    there = {row.path for row in open_dataset(str(spoilable)).committed.shards}
     monkeypatch.setattr(writer, "stored_sizes", lambda group, paths: asked.extend(paths) or sizes(group, paths))
     looked, read_sizes = list[int](), reader.stored_sizes
     monkeypatch.setattr(
@@ -239,7 +239,7 @@ def test_appending_describes_and_looks_at_what_is_new_alone(spoilable: Path, mon
         3, 4, 5,  # the evaluation identities in the new poses
     }  # fmt: skip
     assert run.of("draw_rotations") == [[range(10, 12)]]
-    new = {row.path for row in open_dataset(str(spoilable)).manifest} - there
+    new = {row.path for row in open_dataset(str(spoilable)).committed.shards} - there
     assert new and set(asked) == new
     assert looked[0] == len(there) and len(looked) == 2, "as it is opened to grow, and here to see what is new"
 
@@ -249,7 +249,7 @@ def test_a_grown_dataset_on_a_store_without_a_lock_is_looked_at_again(monkeypatc
     generate(tiny_dataset(), url)
     monkeypatch.setattr(reader, "stored_sizes", lambda group, paths: looked.append(len(paths)) or sizes(group, paths))
     grown = append(url, training=4)
-    assert len(looked) == 2 and looked[1] == len(grown.manifest) > looked[0]
+    assert len(looked) == 2 and looked[1] == len(grown.committed.shards) > looked[0]
 
 
 def test_a_new_shard_that_is_gone_before_the_end_is_not_committed(spoilable: Path) -> None:
@@ -278,7 +278,7 @@ def test_opening_takes_few_requests_however_many_shards(monkeypatch: pytest.Monk
     generate(broad(600), url)
     for name in ("get", "getsize", "exists", "list_prefix"):
         _counted(monkeypatch, name, asked)
-    assert len(open_dataset(url).manifest) == 60
+    assert len(open_dataset(url).committed.shards) == 60
     assert len(asked) < 30 and "getsize" not in asked
 
 

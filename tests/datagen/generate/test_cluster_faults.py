@@ -21,6 +21,7 @@ from datagen.store import open_dataset
 from datagen.store.objects import read_bytes, write_bytes
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
+from tests.support.commands import wait_for
 from tests.support.files import tree_hash
 from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset, tiny_training
@@ -46,14 +47,6 @@ def many_shards() -> DatasetRecipe:
 
 def shard_count(url: Path) -> int:
     return len(list(url.rglob("vertices/c/*/*/0/0")))
-
-
-def wait_for(condition: object, *, seconds: float = 150) -> None:
-    assert callable(condition)
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")

@@ -191,7 +191,7 @@ def many_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = tiny_dataset(
         identities={"training": 36, "evaluation": 0}, poses={"seen": 2, "unseen": 0}, store={"poses_per_shard": 1}
     )
-    rows = generate(recipe, str(place / "legs.zarr")).manifest
+    rows = generate(recipe, str(place / "legs.zarr")).committed.shards
     assert len(rows) == 72
     (place / "legs.zarr" / SHARD).unlink()
     return place

@@ -62,16 +62,16 @@ def test_zarr_alone_reads_every_array(dataset: str) -> None:
     assert np.array_equal(group["pose/parameters"][...], opened.rotations())
     assert group["grid/topology"][...].tolist() == [0] * 5 and group["topology/vertex_count"][...].tolist() == [32]
     rows = group["manifest/rows"][...], group["manifest/bytes"][...], group["manifest/blake3"][...]
-    assert [(row.rows, row.bytes, bytes.fromhex(row.blake3)) for row in opened.manifest] == [
+    assert [(row.rows, row.bytes, bytes.fromhex(row.blake3)) for row in opened.committed.shards] == [
         (*sizes, digest.tobytes()) for *sizes, digest in zip(*rows, strict=True)
     ]
-    for row in opened.manifest:
+    for row in opened.committed.shards:
         assert blake3((Path(dataset) / row.path).read_bytes()).hexdigest() == row.blake3
 
 
 def test_meshes_are_pinned_to_the_byte(dataset: str) -> None:
     """A change of these bytes is a change of what recipes mean: raise the version of the body's asset with it."""
-    digests = sorted(row.blake3 for row in open_dataset(dataset).manifest)
+    digests = sorted(row.blake3 for row in open_dataset(dataset).committed.shards)
     assert hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest() == (
         "924152349283489600ca8097b97a7dd76931adf0eb01e4a570fe2b23dda57be1"
     )
@@ -94,12 +94,12 @@ def test_several_identities_of_few_poses_share_a_shard(tmp_path: Path, dataset: 
         assert np.array_equal(made.vertices(identity, [5, 0]), whole[[5, 0]])
         assert np.array_equal(made.vertices(identity, 3), whole[3])
     codec = ShardCodec(2, 6, 32, "lz4", 5)
-    file = (tmp_path / "x.zarr" / made.manifest[0].path).read_bytes()
+    file = (tmp_path / "x.zarr" / made.committed.shards[0].path).read_bytes()
     chunks = [
         file[start : start + size]
         for start, size in codec.places(codec.decode_index(file[-codec.index_bytes :]), codec.rows_of(2, 6))
     ]
-    old = [shard for shard in other.manifest if shard.path.startswith("grid/training/0/vertices/c/0/")]
+    old = [shard for shard in other.committed.shards if shard.path.startswith("grid/training/0/vertices/c/0/")]
     assert b"".join(chunks[:4]) == (Path(dataset) / old[0].path).read_bytes()[: sum(map(len, chunks[:4]))]
 
 
@@ -107,7 +107,7 @@ def test_identities_that_are_many_are_few_objects(tmp_path: Path) -> None:
     recipe = tiny_dataset(identities={"training": 300, "evaluation": 0}, store={"poses_per_shard": 60})
     made = generate(recipe, str(tmp_path / "x.zarr"))
     objects = sum(path.is_file() for path in (tmp_path / "x.zarr").rglob("*"))
-    assert len(made.manifest) == 30 and objects < 1.2 * 30 + 100
+    assert len(made.committed.shards) == 30 and objects < 1.2 * 30 + 100
 
 
 def test_making_it_twice_gives_the_same_bytes(dataset: str, tmp_path: Path) -> None:

@@ -17,6 +17,13 @@ COARSE = "notoes_collapse3pc"
 FAMILIES = ("anny", "smpl", "smplh", "smplx", "smal", "rigged", "imported", "mixed", "clothed", "leg")
 PEOPLE = ("anny", "smpl", "smplh", "smplx", "mixed", "clothed")
 NPT = {"name": "npt"}
+OLD_CPU = {
+    "OPENBLAS_CORETYPE": "Nehalem",
+    "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX",
+    "ATEN_CPU_CAPABILITY": "default",
+    "MKL_CBWR": "COMPATIBLE",
+}
+"""Variables that restrict OpenBLAS, NumPy and PyTorch to what a CPU of 2008 can do."""
 
 
 def identity(body: Any, number: int = 0, *, seed: int = 0) -> np.ndarray:

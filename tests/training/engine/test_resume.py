@@ -80,6 +80,6 @@ def test_weights_where_early_stopping_ended_the_run_are_the_best(dataset: str, t
     rows = [row for row in read_journal(run / "metrics.jsonl") if "evaluation/pmd_unseen" in row]
     best = min(rows, key=lambda row: row["evaluation/pmd_unseen"])["step"]
     assert best < reached < 400
-    assert load_trained(run)[2] == load_trained(run, "best")[2] == best
-    assert load_trained(run, "latest")[2] == load_trained(run, reached)[2] == reached
+    assert load_trained(run)[2] == require_checkpoint(run, "best").step == best
+    assert require_checkpoint(run, "latest").step == require_checkpoint(run, reached).step == reached
     assert json.loads((require_checkpoint(run).path / "manifest.json").read_text())["last_step"] == 400

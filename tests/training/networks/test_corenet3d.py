@@ -48,6 +48,14 @@ def _unit(vertices: int, seed: int, dtype: torch.dtype = torch.float64, batch: i
     return nn.functional.normalize(torch.randn(batch, vertices, 6, generator=generator, dtype=dtype), dim=2)
 
 
+def _warped(network: CoreNet3D, inputs: dict[str, Tensor]) -> Tensor:
+    """The warped source, which is what the generator is given."""
+    given: list[Tensor] = []
+    with network.generator.register_forward_pre_hook(lambda _, arguments: given.append(arguments[0])):
+        network(**inputs)
+    return given[0]
+
+
 def test_the_singular_vectors_of_nine_layers_are_no_parameters() -> None:
     assert len(list(_network().buffers())) == 2 * 9
 
@@ -153,9 +161,8 @@ def test_the_targets_order_has_an_effect_through_the_wide_convolution_alone() ->
         torch.randperm(27, generator=torch.Generator().manual_seed(3)),
     )
     moved = {"source": inputs["source"], "target": inputs["target"][:, order]}
-    before, after = (network.forward_with_correspondence(**each) for each in (inputs, moved))
-    torch.testing.assert_close(after.warped, before.warped[:, order], rtol=0, atol=1e-10)
-    assert (after.vertices - before.vertices[:, order]).abs().max() > 1e-2
+    torch.testing.assert_close(_warped(network, moved), _warped(network, inputs)[:, order], rtol=0, atol=1e-10)
+    assert (network(**moved) - network(**inputs)[:, order]).abs().max() > 1e-2
     with torch.no_grad():
         network.generator.lift.weight.view(-1, 3, 3)[:, :, ::2] = 0  # neither neighbour
     torch.testing.assert_close(network(**moved), network(**inputs)[:, order], rtol=0, atol=1e-10)
@@ -168,12 +175,12 @@ def test_neighbours_beyond_the_ends_are_zeros() -> None:
 
 def test_correspondence_is_that_of_the_output() -> None:
     network, inputs = _network().eval(), _inputs()
-    found = network.forward_with_correspondence(**inputs)
     vertices, warped, transport = LiteralCoreNet3D(network).with_correspondence(**inputs)
-    torch.testing.assert_close(network(**inputs), found.vertices, rtol=0, atol=1e-10)
-    torch.testing.assert_close(found.transport, transport, rtol=1e-8, atol=1e-12)
-    torch.testing.assert_close(found.warped, warped, rtol=0, atol=1e-10)
-    torch.testing.assert_close(found.vertices, vertices, rtol=0, atol=1e-8)
+    identity, theta, phi, masses = network._described(**inputs)
+    found = transport_matrix(theta, phi, identity.masses, masses)
+    torch.testing.assert_close(found, transport, rtol=1e-8, atol=1e-12)
+    torch.testing.assert_close(_warped(network, inputs), warped, rtol=0, atol=1e-10)
+    torch.testing.assert_close(network(**inputs), vertices, rtol=0, atol=1e-8)
 
 
 def test_spectral_norm_holds_still_in_evaluation_and_closes_in_on_one_in_training() -> None:
@@ -206,14 +213,12 @@ def test_under_autocast_the_result_stays_close_and_float32() -> None:
     network = _network(torch.float32, feature_widths=(32, 64, 64), generator_widths=(128, 64, 32)).eval()
     inputs = _inputs(torch.float32, 200, 150)
     with torch.no_grad():
-        full = network.forward_with_correspondence(**inputs)
+        full, warped = network(**inputs), _warped(network, inputs)
         with torch.autocast("cpu", torch.bfloat16):
-            half = network.forward_with_correspondence(**inputs)
-            plain = network(**inputs)
-    assert half.vertices.dtype == plain.dtype == torch.float32
-    assert torch.equal(half.transport, full.transport)  # features, cosines and transport do not change
-    for vertices in (half.vertices, plain):
-        assert 0 < (vertices - full.vertices).square().mean().sqrt() / full.vertices.std() < 0.03
+            half, same = network(**inputs), _warped(network, inputs)
+    assert half.dtype == torch.float32
+    assert torch.equal(same, warped)  # features, cosines and transport do not change
+    assert 0 < (half - full).square().mean().sqrt() / full.std() < 0.03
 
 
 def test_training_under_autocast_gives_gradients_close_to_the_full_ones() -> None:
@@ -316,6 +321,6 @@ def test_missing_damaged_and_exchanged_files_are_refused(tmp_path: Path) -> None
         load_released_corenet3d(**paths)
 
 
-def test_errors_of_the_correspondence_carry_the_shapes() -> None:
+def test_errors_carry_the_shapes() -> None:
     with pytest.raises(ValueError, match=r"equally many, got shapes \[2, 30, 3\] and \[3, 25, 3\]"):
-        _network().forward_with_correspondence(source=_mesh(30), target=_mesh(25, batch=3))
+        _network()(source=_mesh(30), target=_mesh(25, batch=3))

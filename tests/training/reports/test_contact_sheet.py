@@ -1,6 +1,7 @@
 """A contact sheet shows every kind of identity and pose that a dataset holds."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from matplotlib.image import imread
 from datagen.generate import append, generate
 from tests.support.recipes import tiny_dataset
 from training.reports.contact_sheet import chosen, draw_contact_sheet, identity_groups, pose_groups
+from training.viz.mesh_grid import mesh_grid
 
 
 def test_each_group_gives_some_and_larger_ones_more() -> None:
@@ -23,23 +25,20 @@ def test_unseen_and_appended_poses_are_shown_and_what_is_not_there_is_said(
     url = str(tmp_path / "leg.zarr")
     generate(tiny_dataset(), url)
     dataset = append(url, training=5, seen=12, unseen=6)
-    shown: dict[str, list[str]] = {}
+    shown: dict[str, Any] = {}
 
-    def noted(grid, faces, rows, columns, path, **more):  # type: ignore[no-untyped-def]
-        shown.update(rows=rows, columns=columns, missing=[[one is None for one in row] for row in grid])
-        return drawn(grid, faces, rows, columns, path, **more)
+    def noted(page, path, *, columns, **more):  # type: ignore[no-untyped-def]
+        shown.update(rows=page, columns=columns)
+        return mesh_grid(page, path, columns=columns, **more)
 
-    from training.reports import contact_sheet as module
-
-    drawn = module.contact_sheet
-    monkeypatch.setattr(module, "contact_sheet", noted)
+    monkeypatch.setattr("training.reports.contact_sheet.mesh_grid", noted)
     picture = imread(draw_contact_sheet(dataset, tmp_path / "sheet.png"))
     kinds = {"seen", "unseen", "seen, appended", "unseen, appended"}
     assert {label.partition("\n")[2] for label in shown["columns"]} == kinds
-    assert {label.partition("\n")[2] for label in shown["rows"]} == {"training", "evaluation", "training, appended"}
-    for row, missing in zip(shown["rows"], shown["missing"], strict=True):
-        expected = ["unseen" in column and "training" in row for column in shown["columns"]]
-        assert missing == expected
+    assert {row.label.partition("\n")[2] for row in shown["rows"]} == {"training", "evaluation", "training,\nappended"}
+    for row in shown["rows"]:
+        expected = ["unseen" in column and "training" in row.label for column in shown["columns"]]
+        assert [panel == "not in the dataset" for panel in row.panels] == expected
     assert picture.shape[1] > 1500 and np.ptp(picture) > 0.5
 
 

@@ -44,8 +44,7 @@ from training.tracking.journal import read_journal
 from training.tracking.mlflow_mirror import publish
 from training.tracking.record import EXPERIMENT, Server, begin_record, end_record, read_record, update_record
 from training.viz.comparison_figure import comparison_figure
-from training.viz.transfer_example import Comparison
-from training.viz.transfer_picture import NamedMesh
+from training.viz.transfer_example import Comparison, NamedMesh
 from training.viz.viewer import write_viewer
 from workflows.pipeline.console import guarded, print_facts
 from workflows.studies.sweep.plan import plan_sweep
@@ -227,10 +226,10 @@ def test_a_sweep_of_hostile_descriptions_values_and_reasons(tmp_path: Path) -> N
     begin_record(tmp_path / "trials" / "b", name="b", kind="train", parent=None, parameters={})
     update_record(tmp_path / "trials" / "b", status="FAILED", tags={"failure": f"=HYPERLINK(1) {MARKUP} {TERMINAL}"})
     results = results_of(sweep, tmp_path)
-    text = document_markdown(ALL, parts_of(sweep, results, levels={}, cpus=1))
+    text = document_markdown(ALL, parts_of(sweep, results, cpus=1))
     assert_inert_markdown(text)
     assert sum(line.startswith("|") for line in text.splitlines()) == 4, "one line a trial, a heading and its rule"
-    cells = list(csv.DictReader(table_csv(sweep, results, {}).splitlines(keepends=True)))
+    cells = list(csv.DictReader(table_csv(sweep, results).splitlines(keepends=True)))
     assert next(line for line in cells if line["trial"] == "b")["reason"].startswith("'=HYPERLINK")
 
 

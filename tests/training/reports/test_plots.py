@@ -18,7 +18,8 @@ from training.reports.plots import ablation, convergence, sweep, training_curve
 from training.reports.plots.ablation import ablation_figure
 from training.reports.plots.convergence import convergence_figure, learning_of
 from training.reports.plots.sweep import sweep_figure
-from training.viz.mesh_grid import contact_sheet
+from training.viz.mesh_grid import Panel, mesh_grid
+from training.viz.mesh_grid import Row as Drawn
 from training.viz.style import apart
 
 
@@ -86,13 +87,15 @@ def test_heights_are_moved_apart_in_their_order_and_stay_where_there_is_room(hei
 
 def test_lines_are_named_in_the_order_of_their_ends_and_the_best_finished_one_is_bold(drawn: list[Figure]) -> None:
     broken = curve("broken", 0.5, 0.001, finished=False)
-    levels = {"twice": 0.2, "far above": 3.0}
-    sweep_figure([curve("high", 0.5, 0.4), curve("low", 0.6, 0.01), broken], "unused.png", levels=levels)
+    curves = [curve("high", 0.5, 0.4), curve("low", 0.6, 0.01), broken]
+    sweep_figure(curves, "unused.png", level=("twice", 0.2))
     for panel in (0, 1):
         assert texts(drawn[0], panel) == ["twice", "10.0  broken (unfinished)", "100.0  low", "4000.0  high"]
         assert texts(drawn[0], panel, weight="bold") == ["100.0  low"]
     thick = max(drawn[0].axes[0].get_lines(), key=lambda line: line.get_linewidth())
     assert np.asarray(thick.get_ydata()) == pytest.approx([6000, 100])
+    sweep_figure(curves, "unused.png", level=("far above", 3.0))
+    assert "far above" not in texts(drawn[1], 0)
 
 
 def test_many_runs_with_one_end_have_names_that_do_not_overlap(drawn: list[Figure]) -> None:
@@ -145,12 +148,11 @@ def test_a_training_curve_has_terms_evaluations_rate_and_baselines(drawn: list[F
     assert texts(drawn[0], 1) == ["target unchanged"] and evaluation.get_ylim()[1] > 0.3
 
 
-def test_a_contact_sheet_shows_every_cell_on_one_scale(tmp_path: Path) -> None:
+def test_a_page_shows_every_mesh_on_one_scale(tmp_path: Path) -> None:
     big, small = octahedron(1.0), octahedron(0.5)
-    grid = [[big.vertices, big.vertices + 9.0], [small.vertices, small.vertices]]
-    path = contact_sheet(grid, [big.faces] * 2, ["a", "b"], ["p", "q"], tmp_path / "sheet.png", panel=(90, 100))
-    picture = pixels(path)
-    cells = [picture[70 + 100 * r : 170 + 100 * r, 70 + 90 * c : 160 + 90 * c] for r in (0, 1) for c in (0, 1)]
+    rows = [Drawn(label, [Panel(mesh, (0.2, 0.4, 0.8))] * 2) for label, mesh in (("a", big), ("b", small))]
+    picture = pixels(mesh_grid(rows, tmp_path / "page.png", columns=["p", "q"], title="t", size=(90, 100)))
+    cells = [picture[96 + 126 * r : 196 + 126 * r, 156 + 90 * c : 246 + 90 * c] for r in (0, 1) for c in (0, 1)]
     widths = [int((np.ptp(cell, axis=-1) > 40).any(0).sum()) for cell in cells]
     assert widths[0] == widths[1] and widths[2] == widths[3] == pytest.approx(widths[0] / 2, abs=4)
 
@@ -198,9 +200,9 @@ def test_plots_are_written_whole_and_leave_nothing_else(tmp_path: Path, draw: Ca
             "no finite",
         ),
         (
-            lambda path: contact_sheet([[octahedron().vertices]], [octahedron().faces], ["a"], ["p", "q"], path),
+            lambda path: mesh_grid([Drawn("a", ["none", "none"])], path, columns=["p"], title="t"),
             ValueError,
-            "differ in length",
+            r"need rows of at most 1 panels, got \[2\]",
         ),
     ],
 )

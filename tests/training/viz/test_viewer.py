@@ -14,8 +14,7 @@ import pytest
 from datagen.common.arrays import Floats
 from tests.support.reports.pages import Elements
 from training.viz.look import Look, Paint
-from training.viz.transfer_example import Comparison, Motion, placed
-from training.viz.transfer_picture import NamedMesh
+from training.viz.transfer_example import Comparison, Motion, NamedMesh, placed
 from training.viz.viewer import MOTION_LIMIT, frames_apart, viewer_payload, write_viewer
 
 

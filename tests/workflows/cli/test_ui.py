@@ -5,14 +5,13 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
 
+from tests.support.commands import wait_for
 from tests.support.ranks import free_port
 from workflows.cli.main import main
 
@@ -25,19 +24,12 @@ time.sleep(float(sys.argv[2])); sys.exit(3)
 """
 
 
-def wait_until(happened: Callable[[], bool], seconds: float = 60) -> None:
-    until = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < until, "it did not happen in time"
-        time.sleep(0.05)
-
-
 def keep(tmp_path: Path, seconds: float) -> tuple["subprocess.Popen[bytes]", psutil.Process]:
     """A keeper of a server, and the server's own child."""
     told = tmp_path / "pid"
     words = [sys.executable, "-m", "workflows.cli.keeper", sys.executable, "-c", SERVER, str(told), str(seconds)]
     keeper = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, start_new_session=True)
-    wait_until(lambda: told.exists() and told.read_text() != "")
+    wait_for(lambda: told.exists() and told.read_text() != "")
     return keeper, psutil.Process(int(told.read_text()))
 
 
@@ -50,13 +42,13 @@ def test_the_end_of_its_input_ends_a_server_with_its_children(tmp_path: Path) ->
     assert not gone(child) and keeper.stdin is not None
     keeper.stdin.close()
     keeper.wait(20)
-    wait_until(lambda: gone(child), 5)
+    wait_for(lambda: gone(child), 5)
 
 
 def test_a_server_that_ends_by_itself_leaves_no_child_and_its_status(tmp_path: Path) -> None:
     keeper, child = keep(tmp_path, 1)
     assert keeper.wait(20) == 3
-    wait_until(lambda: gone(child), 5)
+    wait_for(lambda: gone(child), 5)
 
 
 def test_a_folder_without_a_store_and_a_port_that_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,13 +108,13 @@ def test_nothing_is_left_of_mlflow(store: Path, number: signal.Signals, whom: st
     assert make.stdin is not None
     make.stdin.write(makefile)
     make.stdin.close()
-    wait_until(lambda: answers(port), 120)
+    wait_for(lambda: answers(port), 120)
     family = psutil.Process(make.pid).children(recursive=True)
     command = next(process for process in family if "workflows" in process.cmdline())
     assert len(family) > 2
     (command if whom == "it" else psutil.Process(make.pid)).send_signal(number)
     make.wait(30)
-    wait_until(lambda: all(gone(process) for process in family), 15)
+    wait_for(lambda: all(gone(process) for process in family), 15)
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", port))

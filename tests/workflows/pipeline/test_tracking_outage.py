@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import mlflow
 import pytest
 
 from datagen.common.errors import TrackingError
+from tests.support.commands import wait_for
 from tests.support.ranks import free_port
 from training.tracking.journal import Journal, read_journal
 from training.tracking.mlflow_mirror import Mirror, publish
@@ -71,13 +72,6 @@ def server(tmp_path: Path) -> Iterator[TrackingServer]:
     found = TrackingServer(tmp_path)
     yield found
     found.kill()
-
-
-def wait_for(happened: Callable[[], bool], seconds: float) -> None:
-    until = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < until, "what was waited for never came"
-        time.sleep(0.05)
 
 
 def begin(root: Path) -> Path:

@@ -12,10 +12,11 @@ from matplotlib.lines import Line2D
 
 from training.evaluation.evaluate import POSE_TYPES, Row
 from training.evaluation.statistics import mean_and_interval
+from training.objectives import PMD_UNIT
 from training.recipes.networks import DSFFNET
 from training.viz.style import DPI, INK, PAGE, QUIET, RULE, logarithmic, method_colors, saved, style_axes
 
-_METRICS = (("PMD (1e-4)", "pmd", 1e4), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
+_METRICS = (("PMD (1e-4)", "pmd", 1 / PMD_UNIT), ("CD (1e-4)", "chamfer", 1e4), ("EMD (1e-3)", "earth_mover", 1e3))
 _OFFSETS = {"seen": 0.17, "unseen": -0.17}
 _AXES, _ROW, _TOP, _BOTTOM, _LETTER = 2.55, 0.5, 0.66, 0.34, 0.072  # inches
 

@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 
 from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
-from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
+from training.evaluation.run_curves import RunCurve, run_curve
+from training.objectives import PMD_UNIT
 from training.recipes.files import recipe_in
 from training.tracking.journal import read_journal
 from training.viz.style import DPI, INK, PAGE, EndLabel, label_ends, method_colors, saved, style_learning

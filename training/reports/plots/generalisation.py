@@ -18,6 +18,7 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from training.evaluation.generalisation import GeneralisationRow, grid_of, no_op_line
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.robustness import NO_OP, Case, methods_in
+from training.objectives import PMD_UNIT
 from training.reports.plots.robustness import TAKES_EQUAL, count_of, output_panel
 from training.viz.mesh_grid import Panel, Row, mesh_grid, standing
 from training.viz.style import DPI, INK, PAGE, ROLE_COLORS, saved, short
@@ -56,7 +57,7 @@ def heat_map(
         There is nothing to draw.
     """
     names = methods_in(rows)
-    grids = [np.vstack([grid_of(rows, kinds, name), no_op_line(rows, kinds)]) * 1e4 for name in names]
+    grids = [np.vstack([grid_of(rows, kinds, name), no_op_line(rows, kinds)]) / PMD_UNIT for name in names]
     if not grids or not np.isfinite(grids).any():
         raise ValueError("there are no numbers to draw")
     norm = LogNorm(float(np.nanmin(grids)), float(np.nanmax(grids)))

@@ -12,6 +12,7 @@ from datagen.mesh.geometry import Mesh, bounding_box
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, in_words, transfer_each
 from training.evaluation.robustness import Case, RobustnessRow, curve, disturbed, methods_in, no_op, refusal
+from training.objectives import PMD_UNIT
 from training.viz.mesh_grid import Panel, Row, drawable, mesh_grid, standing
 from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, logarithmic, method_colors, saved, short, style_axes
 
@@ -55,11 +56,15 @@ def _draw_curves(axes: Axes, rows: Sequence[RobustnessRow], disturbance: Disturb
     for name, color in method_colors(methods_in(rows)).items():
         levels = curve(rows, name, disturbance.name)
         at = [_place(disturbance, level.amount) for level in levels]
-        mean, low, high = (np.array([getattr(level, key) for level in levels]) * 1e4 for key in ("mean", "low", "high"))
+        mean, low, high = (
+            np.array([getattr(level, key) for level in levels]) / PMD_UNIT for key in ("mean", "low", "high")
+        )
         axes.plot(at, mean, color=color, linewidth=1.6, marker="o", markersize=2.6, label=name)
         axes.fill_between(at, low, high, color=color, alpha=0.18, linewidth=0)
     if np.isfinite(no_op(rows)):
-        axes.axhline(no_op(rows) * 1e4, color=QUIET, linewidth=0.9, linestyle=(0, (5, 3)), label="target unchanged")
+        axes.axhline(
+            no_op(rows) / PMD_UNIT, color=QUIET, linewidth=0.9, linestyle=(0, (5, 3)), label="target unchanged"
+        )
     axes.set_title(disturbance.heading, fontsize=8, color=INK, loc="left", weight="bold", pad=4)
     axes.set_xlabel(_unit(disturbance), fontsize=7, color=INK, labelpad=1)
     axes.set_xticks([_place(disturbance, amount) for amount in _ticks(disturbance)])

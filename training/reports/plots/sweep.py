@@ -1,14 +1,15 @@
 """Curves of several runs in one picture: PMD over steps and over seconds, each line named at its end."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from training.evaluation.run_curves import PMD_UNIT, RunCurve
+from training.evaluation.run_curves import RunCurve
+from training.objectives import PMD_UNIT
 from training.viz.style import DPI, INK, PAGE, QUIET, EndLabel, dashed_level, label_ends, saved, style_learning
 
 _BEST = "#d1462f"
@@ -24,7 +25,7 @@ def sweep_figure(
     path: str | os.PathLike[str],
     *,
     title: str = "",
-    levels: Mapping[str, float] | None = None,
+    level: tuple[str, float] | None = None,
 ) -> Path:
     """Draw PMD on unseen poses over steps and over seconds, with the run that ends lowest highlighted.
 
@@ -37,8 +38,8 @@ def sweep_figure(
         Runs without a drawable (positive) value are left out.
     path : path of the PNG to write
     title : str
-    levels : dict, optional
-        Name -> PMD, drawn as dashed lines unless all values lie below.
+    level : (str, float), optional
+        Name and PMD, drawn as a dashed line unless all values lie below.
     """
     drawable = [curve.drawable for curve in curves if len(curve.drawable)]
     drawn = sorted(drawable, key=lambda curve: (not curve.finished, curve.final))
@@ -46,7 +47,7 @@ def sweep_figure(
         raise ValueError("no run has a PMD to draw")
     figure, axes = _page(len(drawn), max(len(_label(curve)) for curve in drawn), title)
     for panel, over, label in zip(axes, ("steps", "seconds"), ("step", "seconds of training"), strict=True):
-        _draw_panel(panel, drawn, over, levels or {})
+        _draw_panel(panel, drawn, over, level)
         panel.set_xlabel(label, fontsize=8, color=INK, labelpad=2)
     for panel, over in zip(axes, ("steps", "seconds"), strict=True):  # the shared limits are known only now
         _name_lines(panel, drawn, over)
@@ -69,13 +70,12 @@ def _color(rank: int) -> str:
     return (_BEST, *_OTHERS)[rank] if rank <= len(_OTHERS) else _REST
 
 
-def _draw_panel(axes: Axes, curves: Sequence[RunCurve], over: str, levels: Mapping[str, float]) -> None:
+def _draw_panel(axes: Axes, curves: Sequence[RunCurve], over: str, level: tuple[str, float] | None) -> None:
     for rank, curve in reversed(list(enumerate(curves))):
         line: dict[str, Any] = {"color": _color(rank), "linewidth": 1.1 if rank else 2.4, "solid_capstyle": "round"}
         axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, marker="o", markersize=1.8 if rank else 3, **line)
-    highest = max(curve.pmd.max() for curve in curves)
-    for name, level in ((name, level) for name, level in levels.items() if level <= highest):
-        dashed_level(axes, name, level / PMD_UNIT, right=False)
+    if level and level[1] <= max(curve.pmd.max() for curve in curves):
+        dashed_level(axes, level[0], level[1] / PMD_UNIT, right=False)
     style_learning(axes)
     axes.set_ylabel("PMD on unseen poses (1e-4)", fontsize=8, color=INK)
 

@@ -9,9 +9,10 @@ from training.data.triples import last_step_of
 from training.evaluation.document import Table
 from training.evaluation.evaluate import Row
 from training.evaluation.paper_numbers import PaperData
-from training.evaluation.run_curves import PMD_UNIT, run_curve
+from training.evaluation.run_curves import run_curve
 from training.evaluation.tables import DEFINITIONS, summary, table_1, table_2, table_3
 from training.evaluation.timing import Inference
+from training.objectives import PMD_UNIT
 from training.reports.card_texts import span, vertex_counts
 from training.tracking.journal import read_journal
 from workflows.pipeline.evaluate import emd_points_of

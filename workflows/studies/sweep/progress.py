@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from training.evaluation.run_curves import PMD_UNIT
+from training.objectives import PMD_UNIT
 from training.tracking.journal import journal_from
 from workflows.pipeline.progress import bar
 from workflows.pipeline.stage import say

@@ -2,17 +2,16 @@
 
 import csv
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.common.errors import RecipeError
 from datagen.common.files import write_atomically
 from datagen.store import open_dataset
 from training.evaluation.document import Table, Text, document_markdown, plain
 from training.evaluation.results import inert
-from training.evaluation.run_curves import PMD_UNIT, RunCurve, run_curve
+from training.evaluation.run_curves import RunCurve, run_curve
+from training.objectives import PMD_UNIT
 from training.reports.blocks import Section
 from training.reports.card_texts import span, vertex_counts
 from training.reports.cards import dataset_card
@@ -26,7 +25,6 @@ from workflows.studies.sweep.plan import Sweep, Trial, varied_values
 
 FILES = ("report.html", "report.md", "sweep.md", "sweep.csv", "figures/sweep.png", "best.yaml")
 _STATES = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "stopped", "RUNNING": "unfinished"}
-_LEVEL = re.compile(r"(\d+(?:\.\d+)?)(x?)")
 _DEFINITION = """\
 **PMD** point-wise mesh distance, times 1e4: mean over vertices and coordinates of (output - truth)^2 in the normalised
 box (each mesh centred and divided by half its longest box edge), here over {triples} fixed triples of each pose type
@@ -57,25 +55,6 @@ class TrialResult:
         return self.steps * self.trial.training.batch / self.seconds if self.seconds else float("nan")
 
 
-def parse_levels(words: Sequence[str]) -> tuple[tuple[float, bool], ...]:
-    """Levels of PMD from words: ``2x`` is twice the best final PMD of the sweep, ``40`` is 40e-4.
-
-    Returns
-    -------
-    tuple of (number, whether it is times the best)
-
-    Raises
-    ------
-    RecipeError
-        A word is neither.
-    """
-    found = [_LEVEL.fullmatch(word) for word in words]
-    for word, match in zip(words, found, strict=True):
-        if match is None or float(match[1]) <= 0:
-            raise RecipeError(f"--reach {word!r} is neither like 2x (times the best final PMD) nor like 40 (PMD x1e-4)")
-    return tuple((float(match[1]), bool(match[2])) for match in found if match)
-
-
 def results_of(sweep: Sweep, out: Path) -> list[TrialResult]:
     """What is known of every trial, finished ones first, the lowest final PMD on unseen poses before the others."""
     found = [_result(trial, out) for trial in sweep.trials]
@@ -87,34 +66,24 @@ def best_of(results: Sequence[TrialResult]) -> TrialResult | None:
     return next((result for result in results if result.finished and len(result.unseen)), None)
 
 
-def named_levels(results: Sequence[TrialResult], levels: Sequence[tuple[float, bool]]) -> dict[str, float]:
-    """Name -> PMD of each level; those that are times the best are left out where no trial has finished."""
+def twice_the_best(results: Sequence[TrialResult]) -> tuple[str, float] | None:
+    """Name and PMD of the level whose first reaching is reported, None where no trial has finished."""
     best = best_of(results)
-    named = {}
-    for number, relative in levels:
-        if not relative:
-            named[f"{number:g}"] = number * PMD_UNIT
-        elif best is not None:
-            pmd = number * best.unseen.final
-            named[f"{number:g}x best ({pmd / PMD_UNIT:.1f})"] = pmd
-    return named
+    return (f"2x best ({2 * best.unseen.final / PMD_UNIT:.1f})", 2 * best.unseen.final) if best else None
 
 
-def write_report(
-    sweep: Sweep, out: Path, *, name: str, levels: Sequence[tuple[float, bool]], cpus: int
-) -> list[TrialResult]:
+def write_report(sweep: Sweep, out: Path, *, name: str, cpus: int) -> list[TrialResult]:
     """Write what the trials' journals say now: sweep.md, sweep.csv, figures/sweep.png, best.yaml and the report."""
     from workflows.recipe.loader import save_recipe
 
     results = results_of(sweep, out)
-    reach, best = named_levels(results, levels), best_of(results)
-    parts = parts_of(sweep, results, levels=reach, cpus=cpus)
+    best, parts = best_of(results), parts_of(sweep, results, cpus=cpus)
     write_atomically(out / "sweep.md", document_markdown(f"Sweep {name}", parts).encode())
-    write_atomically(out / "sweep.csv", table_csv(sweep, results, reach).encode())
+    write_atomically(out / "sweep.csv", table_csv(sweep, results).encode())
     curves = [result.unseen for result in results if len(result.unseen)]
     if curves:
         title = f"{name}: {len(curves)} trainings, PMD on unseen poses"
-        sweep_figure(curves, out / "figures" / "sweep.png", title=title, levels=reach)
+        sweep_figure(curves, out / "figures" / "sweep.png", title=title, level=twice_the_best(results))
     if best is not None:
         about = f"The best of sweep {name}: trial {best.trial.name}."
         save_recipe(best.trial.recipe.model_copy(update={"description": about}), out / "best.yaml")
@@ -135,9 +104,7 @@ def _write_page(out: Path, name: str, parts: Sequence[Text | Table]) -> None:
     write_page(out, title=f"Sweep {name}", lead=lead, sections=sections)
 
 
-def parts_of(
-    sweep: Sweep, results: Sequence[TrialResult], *, levels: dict[str, float], cpus: int
-) -> tuple[Text | Table, ...]:
+def parts_of(sweep: Sweep, results: Sequence[TrialResult], *, cpus: int) -> tuple[Text | Table, ...]:
     """The table with its definitions, what each trial sets, and why some failed."""
     best = best_of(results)
     threads = f"{cpus} thread{'s' if cpus > 1 else ''}"
@@ -153,25 +120,25 @@ def parts_of(
     ]
     return (
         Text(f"{len(results)} trainings from recipe {plain(sweep.recipe_name)}{words}. Lower PMD is better."),
-        Table(table(results, levels)),
+        Table(table(results)),
         *(Text(part) for part in after if part),
     )
 
 
-def table(results: Sequence[TrialResult], levels: dict[str, float]) -> list[list[str]]:
+def table(results: Sequence[TrialResult]) -> list[list[str]]:
     """Heading and one line a trial, as text."""
-    reach = [heading for level in levels for heading in (f"step to {level}", "s")]
+    level = twice_the_best(results)
+    reach = [f"step to {level[0]}", "s"] if level else []
     ends = ["unseen, end", "best", "at step", "seen, end", "best"]
     lines = [["trial", "what varies", *ends, *reach, "steps", "seconds", "meshes/s", "state"]]
     for result in results:
-        first = [result.unseen.first_reached(level) for level in levels.values()]
         lines.append(
             [
                 result.trial.name,
                 result.trial.description or _words(result.trial),
                 *_ends(result.unseen, with_step=True),
                 *_ends(result.seen, with_step=False),
-                *(cell for found in first for cell in ((f"{found[0]:,.0f}", f"{found[1]:.0f}") if found else "--")),
+                *(_reached(result.unseen, level[1]) if level else []),
                 f"{result.steps:,}",
                 f"{result.seconds:.0f}",
                 f"{result.meshes_per_second:.1f}" if result.seconds else "-",
@@ -181,9 +148,10 @@ def table(results: Sequence[TrialResult], levels: dict[str, float]) -> list[list
     return lines
 
 
-def table_csv(sweep: Sweep, results: Sequence[TrialResult], levels: dict[str, float]) -> str:
+def table_csv(sweep: Sweep, results: Sequence[TrialResult]) -> str:
     """The same for programs: PMD as measured (not times 1e4), and every varied key as a column."""
-    rows = [_csv_row(sweep, result, levels) for result in results]
+    level = twice_the_best(results)
+    rows = [_csv_row(sweep, result, level and level[1]) for result in results]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -191,7 +159,7 @@ def table_csv(sweep: Sweep, results: Sequence[TrialResult], levels: dict[str, fl
     return text.getvalue()
 
 
-def _csv_row(sweep: Sweep, result: TrialResult, levels: dict[str, float]) -> dict[str, object]:
+def _csv_row(sweep: Sweep, result: TrialResult, level: float | None) -> dict[str, object]:
     values = varied_values(sweep, result.trial)
     row: dict[str, object] = {"trial": result.trial.name, "state": result.state, "reason": result.reason}
     row |= {key: values.get(key, "") for key in sweep.varied}
@@ -199,9 +167,9 @@ def _csv_row(sweep: Sweep, result: TrialResult, levels: dict[str, float]) -> dic
         row[f"pmd_{pose_type}"] = curve.final if len(curve) else ""
         row[f"best_pmd_{pose_type}"] = curve.pmd.min() if len(curve) else ""
         row[f"step_of_best_{pose_type}"] = int(curve.steps[curve.pmd.argmin()]) if len(curve) else ""
-    for number, pmd in enumerate(levels.values(), 1):
-        step, seconds = result.unseen.first_reached(pmd) or ("", "")
-        row |= {f"level_{number}": pmd, f"level_{number}_step": step, f"level_{number}_seconds": seconds}
+    if level is not None:
+        step, seconds = result.unseen.first_reached(level) or ("", "")
+        row |= {"level_1": level, "level_1_step": step, "level_1_seconds": seconds}
     return row | {
         "steps": result.steps,
         "seconds": result.seconds,
@@ -232,6 +200,11 @@ def _ends(curve: RunCurve, *, with_step: bool) -> list[str]:
         return ["-"] * (3 if with_step else 2)
     step = [f"{curve.steps[curve.pmd.argmin()]:,.0f}"] if with_step else []
     return [f"{curve.final / PMD_UNIT:.2f}", f"{curve.pmd.min() / PMD_UNIT:.2f}", *step]
+
+
+def _reached(curve: RunCurve, level: float) -> list[str]:
+    first = curve.first_reached(level)
+    return [f"{first[0]:,.0f}", f"{first[1]:.0f}"] if first else ["-", "-"]
 
 
 def _words(trial: Trial) -> str:

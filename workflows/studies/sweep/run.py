@@ -11,7 +11,7 @@ from datagen.common.errors import TrainingStopped, WorkflowError
 from datagen.common.files import read_text_within
 from datagen.store import open_dataset
 from training.data.triples import last_step_of
-from training.evaluation.run_curves import PMD_UNIT
+from training.objectives import PMD_UNIT
 from training.tracking.record import has_record, read_record, update_record
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import ray_cluster
@@ -39,7 +39,6 @@ class Settings:
     """How trials are run and reported; nothing of it changes what is trained."""
 
     name: str
-    levels: tuple[tuple[float, bool], ...] = ((2.0, True),)
     cpus: int = 1
     gpus: float = 0.0
     strict: bool = False
@@ -179,7 +178,7 @@ def _report(sweep: Sweep, out: Path, settings: Settings) -> None:
 
 
 def _write_report(sweep: Sweep, out: Path, settings: Settings) -> list[TrialResult]:
-    return write_report(sweep, out, name=settings.name, levels=settings.levels, cpus=settings.cpus)
+    return write_report(sweep, out, name=settings.name, cpus=settings.cpus)
 
 
 def judge(outcomes: Sequence[Outcome], *, of: int, strict: bool) -> None:

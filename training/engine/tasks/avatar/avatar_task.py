@@ -13,8 +13,7 @@ from training.avatar.outfit import Outfit
 from training.avatar.wardrobe import Wardrobe
 from training.data.cache_policy import Room
 from training.engine.distributed import Ranks, agreed
-from training.engine.tasks.avatar.frames import FrameOrder, drawn
-from training.engine.tasks.protocol import Shares
+from training.engine.tasks.avatar.frames import FrameFeed, FrameOrder, drawn
 from training.objectives.point_losses import Edges, Scan, avatar_loss, nearest
 from training.recipes.networks import AvatarRecipe
 from training.recipes.training import TrainingRecipe
@@ -88,22 +87,20 @@ class AvatarTask:
         return AvatarObjective(network, self._network.normals_from * steps, edges, self._network.roughness)
 
     @contextmanager
-    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["FrameFeed"]:
+    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["ScanFeed"]:
         """Scans' points, in memory."""
         yield agreed(ranks, lambda: self._feed(ranks, device), what="read the scans")
 
-    def _feed(self, ranks: Ranks, device: torch.device) -> "FrameFeed":
-        return FrameFeed(self._recipe, self._wardrobe.to(device), self._outfits, self.order, ranks, device)
+    def _feed(self, ranks: Ranks, device: torch.device) -> "ScanFeed":
+        return ScanFeed(self._recipe, self._wardrobe.to(device), self._outfits, self.order, ranks, device)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "AvatarValidation":
         """Measures how far the avatar is from scans."""
         return AvatarValidation(self._wardrobe, self._outfits, device, dtype)
 
 
-class FrameFeed:
-    """This rank's share of every step's frames, so many points of each scan."""
-
-    where = "memory"
+class ScanFeed(FrameFeed):
+    """Frames with so many points of each scan."""
 
     def __init__(
         self,
@@ -114,17 +111,10 @@ class FrameFeed:
         ranks: Ranks,
         device: torch.device,
     ) -> None:
+        super().__init__(recipe, order, ranks, device)
         assert isinstance(recipe.network, AvatarRecipe)
-        self._seed, self._count, self._wardrobe, self._order = recipe.seed, recipe.network.scan_points, wardrobe, order
+        self._count, self._wardrobe = recipe.network.scan_points, wardrobe
         self._surfaces = [its.surfaces.load() for its in outfits]
-        self._mine, self._device = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}, device
-
-    def batches(self, first_step: int) -> Shares:
-        """See :class:`training.engine.tasks.protocol.Feed`."""
-        places = self._order.places(**self._mine)
-        for step, share in enumerate(self._order.batches(first_step=first_step, **self._mine), first_step):
-            parts = zip(share, places, strict=True)
-            yield share, [self._batch(rows.tolist(), step, first) for rows, first in parts]
 
     def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> FrameBatch:
         maps, transforms = self._wardrobe.given(rows)

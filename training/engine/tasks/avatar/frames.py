@@ -1,14 +1,20 @@
 """Frames of subjects in the order that a training shows them, and what is drawn for each."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError
 from datagen.common.seeding import Stream, generator
 from training.data.order import BatchOrder
+from training.engine.distributed import Ranks
+from training.engine.tasks.protocol import Shares
+from training.recipes.training import TrainingRecipe
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,27 @@ class FrameOrder(BatchOrder):
     def epoch(self, number: int) -> NDArray[np.int64]:
         rows = np.array([(subject, frame) for subject, its in enumerate(self.frames) for frame in its], np.int64)
         return generator(self.seed, Stream.TRAINING_TRIPLES, number).permutation(rows)
+
+
+class FrameFeed(ABC):
+    """This rank's share of every step's frames; see :class:`training.engine.tasks.protocol.Feed`."""
+
+    where = "memory"
+
+    def __init__(self, recipe: TrainingRecipe, order: FrameOrder, ranks: Ranks, device: torch.device) -> None:
+        self._seed, self._order, self._device = recipe.seed, order, device
+        self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}
+
+    def batches(self, first_step: int) -> Shares:
+        """See :class:`training.engine.tasks.protocol.Feed`."""
+        places = self._order.places(**self._mine)
+        for step, share in enumerate(self._order.batches(first_step=first_step, **self._mine), first_step):
+            parts = zip(share, places, strict=True)
+            yield share, [self._batch(rows.tolist(), step, first) for rows, first in parts]
+
+    @abstractmethod
+    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> Any:
+        """The examples of rows (subject, frame); the first of them has the place ``first`` in the whole batch."""
 
 
 def drawn(seed: int, step: int, place: int, *, of: int, count: int) -> NDArray[np.int64]:

@@ -14,8 +14,7 @@ from training.avatar.outfit import OccupancySamples, Outfit
 from training.avatar.template import near_surface_iou, template_loss
 from training.data.cache_policy import Room
 from training.engine.distributed import Ranks
-from training.engine.tasks.avatar.frames import FrameOrder, drawn
-from training.engine.tasks.protocol import Shares
+from training.engine.tasks.avatar.frames import FrameFeed, FrameOrder, drawn
 from training.networks.template import OccupancyTemplate
 from training.recipes.networks import TemplateRecipe
 from training.recipes.training import TrainingRecipe
@@ -96,10 +95,8 @@ class TemplateTask:
         return OccupancyValidation(self._samples, device, dtype)
 
 
-class OccupancyFeed:
-    """This rank's share of every step's frames, so many points of each."""
-
-    where = "memory"
+class OccupancyFeed(FrameFeed):
+    """Frames with so many points around each scan."""
 
     def __init__(
         self,
@@ -110,17 +107,11 @@ class OccupancyFeed:
         ranks: Ranks,
         device: torch.device,
     ) -> None:
-        self._seed, self._network, self._samples, self._order = recipe.seed, network, samples, order
-        self._mine, self._device = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}, device
+        super().__init__(recipe, order, ranks, device)
+        self._network, self._samples = network, samples
 
-    def batches(self, first_step: int) -> Shares:
-        """See :class:`training.engine.tasks.protocol.Feed`."""
-        places = self._order.places(**self._mine)
-        for step, share in enumerate(self._order.batches(first_step=first_step, **self._mine), first_step):
-            parts = zip(share, places, strict=True)
-            yield share, [self._batch(rows[:, 1].tolist(), step, first) for rows, first in parts]
-
-    def _batch(self, frames: list[int], step: int, first: int) -> OccupancyBatch:
+    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> OccupancyBatch:
+        frames = [frame for _, frame in rows]
         own, (points, inside) = self._samples, self._samples.hands
         taken = [
             own.frame(frame, drawn(self._seed, step, first + row, of=own.count, count=self._network.points))

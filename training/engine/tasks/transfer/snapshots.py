@@ -14,6 +14,7 @@ from datagen.common.arrays import Floats, Integers
 from datagen.mesh.geometry import Mesh, standing_point
 from training.data.batch import Batch
 from training.inference.predict import predict
+from training.objectives import PMD_UNIT
 from training.objectives.metrics import point_mesh_distance
 from training.viz.render.camera import Camera, frame
 from training.viz.render.renderer import render_mesh
@@ -107,7 +108,7 @@ def _rows(network: nn.Module, batch: Batch, faces: Integers) -> list[_Row]:
                 for role in COLUMNS
             },
             faces=np.asarray(faces, np.int64),
-            caption=f"PMD {pmd[number] * 1e4:.1f}e-4" if np.isfinite(pmd[number]) else "not finite",
+            caption=f"PMD {pmd[number] / PMD_UNIT:.1f}e-4" if np.isfinite(pmd[number]) else "not finite",
         )
         for number in range(len(pmd))
     ]

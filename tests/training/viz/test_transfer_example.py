@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.image import imread
 
 from training.viz.comparison_figure import comparison_figure
-from training.viz.transfer_picture import NamedMesh, shown
+from training.viz.transfer_example import NamedMesh, shown
 from training.viz.viewer import write_viewer
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 1.0]])
