@@ -5,8 +5,9 @@
 For each Anny topology one table, measured in interleaved rounds on one core: the NPT way (one mesh at a time: NumPy
 skinning of every vertex by its own 4x4 matrix, text OBJ; written anew from its description), Anny's own batched
 forward, this project's body alone (another identity in each round, as in each shard), and tasks of whole shards
-(identity, pose, check, compress, checksum, hash, write). Then reading, size, a worker's memory, and one against two
-Ray workers.
+(identity, pose, check, compress, checksum, hash, write); beside them files of as many bytes, which is what new pages
+cost on this machine: a virtual one may take 10 us for each that it has not used before. Then reading, size, a worker's
+memory, and one against two Ray workers.
 """
 
 import os
@@ -97,6 +98,7 @@ def measure(topology: str, folder: Path) -> None:
         "anny": "Anny's own forward, batch 100",
         "body": "our body alone, batch 100",
         "shard": "whole shards, to disk",
+        "files": "files of as many bytes, alone",
     }
     ways: dict[str, tuple[Callable[[], object], int]] = {
         "one": (
@@ -106,6 +108,7 @@ def measure(topology: str, folder: Path) -> None:
         "anny": (forward, POSES),
         "body": (lambda: body.vertices(people.pop(), poses), POSES),
         "shard": (lambda: ensure_shards(url, recipe, [(todo.pop(), None) for _ in range(SHARDS)]), SHARDS * POSES),
+        "files": (lambda: plain_files(Path(url), shards[len(todo) :][:SHARDS], folder), SHARDS * POSES),
     }
     forward(), body.vertices(people.pop(), poses)
     found = {name: [] for name in ways}  # type: dict[str, list[float]]
@@ -119,7 +122,15 @@ def measure(topology: str, folder: Path) -> None:
             f"  {label:38} {middle[name]:9,.0f} meshes/s   x{middle[name] / middle['one']:7.1f} NPT's way"
             f"   x{middle[name] / middle['anny']:5.2f} Anny's forward   x{middle[name] / middle['body']:5.2f} our body"
         )
+    apart = 1 / (1 / middle["body"] + 1 / middle["files"])
+    print(f"  whole shards make x{middle['shard'] / apart:.2f} of our body and such files one after the other")
     reading(url, recipe, shards, folder)
+
+
+def plain_files(store: Path, shards: list[Shard], folder: Path) -> None:
+    """Write for each of some shards a new file of as many bytes."""
+    for shard in shards:
+        (folder / shard.path.replace("/", "-")).write_bytes(bytes((store / shard.path).stat().st_size))
 
 
 def reading(url: str, recipe: DatasetRecipe, shards: list[Shard], folder: Path) -> None:
@@ -203,7 +214,8 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 measure(topology, Path(folder))
     memory(topologies[-1])
-    scaling(topologies[0], identities=60 if topologies[0] == "anny" else 400)  # of anny 400 would be 5 GB
+    for topology in dict.fromkeys([topologies[0], topologies[-1]]):
+        scaling(topology, identities=60 if topology == "anny" else 400)  # of anny 400 would be 5 GB
 
 
 if __name__ == "__main__":
