@@ -28,7 +28,8 @@ def draw_contact_sheet(dataset: Dataset, path: Path) -> Path:
     headings = [f"pose {p}\n{grid.pose_type(p)}{_appended(p, before[1])}" for p in columns]
     labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}".replace(", ", ",\n") for i in rows]
     title = f"{len(rows)} of {grid.identity_count:,} identities in {len(columns)} of {grid.pose_count:,} poses"
-    page = [Row(label, _panels(dataset, i, columns, hue)) for label, i, hue in zip(labels, rows, _HUES, strict=False)]
+    hues = _HUES[: len(rows)]
+    page = [Row(label, _panels(dataset, i, columns, hue)) for label, i, hue in zip(labels, rows, hues, strict=True)]
     return mesh_grid(page, path, columns=headings, title=title)
 
 

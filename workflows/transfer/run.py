@@ -291,7 +291,7 @@ class TransferWork:
 
 
 def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None") -> "NamedMesh":
-    from training.viz.transfer_example import NamedMesh  # it brings matplotlib, which a transfer needs only here
+    from training.viz.transfer_example import NamedMesh  # pictures alone need it
 
     fits = look is not None and look.fits(len(mesh.vertices), len(mesh.faces))
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name, look if fits else None)
