@@ -25,7 +25,7 @@ from datagen.common.errors import BodyError, MeshError, StorageError, storage_er
 from datagen.common.files import write_atomically
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Content, Encoded, one_word
-from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from datagen.mesh.limits import DAMAGE, refuse_huge, require_file, require_known, require_thickness
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = ()) -> MeshF
         faces without vertices, no extent, no thickness, too many vertices, geometries that are not one body.
     """
     read = _read(Path(path), geometries)
-    require_thickness(read.content.vertices, read.path)
+    require_thickness(InFaces.checked(read.mesh, name=str(path)).mesh.vertices, read.path)
     return read
 
 

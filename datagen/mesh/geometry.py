@@ -4,6 +4,7 @@ A person's own files, with all that is in them, are read and written by :mod:`da
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,52 @@ class Mesh:
 
     vertices: NDArray[np.floating]
     faces: NDArray[np.integer]
+
+
+class InFaces:
+    """A mesh as it is seen, without vertices that are a corner of no triangle, as exporters leave behind.
+
+    Attributes
+    ----------
+    rows, loose
+        Numbers of the vertices that remain, and of the others: none of them where there are no triangles, as of points.
+    mesh
+        The mesh of these alone.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        first, second, third = mesh.faces.T
+        is_seen = np.zeros(len(mesh.vertices), np.bool_)
+        is_seen[mesh.faces[(first != second) & (second != third) & (third != first)]] = True
+        self.rows, self.loose = np.flatnonzero(is_seen | ~is_seen.any()), np.flatnonzero(~is_seen & is_seen.any())
+        self._whole = self.mesh = mesh
+        if len(self.loose):
+            kept = mesh.faces[is_seen[mesh.faces].all(axis=1)]
+            self.mesh = Mesh(mesh.vertices[self.rows], np.searchsorted(self.rows, kept))
+
+    @classmethod
+    def checked(cls, mesh: Mesh, *, name: str) -> "InFaces":
+        """Of a mesh that is usable, and is so without what is in no face; MeshError as :func:`check_mesh`."""
+        found = cls(check_mesh(mesh, name=name))
+        check_mesh(found.mesh, name=name)
+        return found
+
+    def of_all(self, vertices: Floats) -> Floats:
+        """Where the vertices of ``mesh`` [n, 3] came to lie -> all; those in no face move as the nearest other does."""
+        return vertices[self._nearest] + self._off if len(self.loose) else vertices
+
+    @cached_property
+    def _nearest(self) -> NDArray[np.integer]:
+        from scipy.spatial import cKDTree
+
+        found = np.zeros(len(self._whole.vertices), np.int64)
+        found[self.rows] = np.arange(len(self.rows))
+        found[self.loose] = cKDTree(self.mesh.vertices).query(self._whole.vertices[self.loose])[1]
+        return found
+
+    @cached_property
+    def _off(self) -> Floats:
+        return self._whole.vertices - self.mesh.vertices[self._nearest]
 
 
 @dataclass(frozen=True)
@@ -126,6 +173,25 @@ def vertex_normals(vertices: Floats, faces: Integers) -> NDArray[np.float64]:
 def triangles_of(quads: NDArray[np.int64]) -> NDArray[np.int64]:
     """Triangles [2 quad, 3] of quads [quad, 4], split along the first diagonal: all first halves, then all second."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+_ONE_PLACE = 3e-6  # of the longest edge of the box: more than six decimals leave of a body in metres
+
+
+def places_of(vertices: Floats) -> NDArray[np.int64]:
+    """The number [n] of the place that each vertex [n, 3] is at; those at one place but for rounding share it.
+
+    Seams of textures are such, which some formats store as several vertices, and parts that were placed apart.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    points, point_of = np.unique(vertices, axis=0, return_inverse=True)
+    near = cKDTree(points).query_pairs(_ONE_PLACE * float(np.ptp(points, axis=0).max()), output_type="ndarray")
+    links = coo_array((np.ones(len(near), np.bool_), near.T), shape=(len(points), len(points)))
+    place_of = connected_components(links, directed=False)[1]
+    return np.asarray(place_of[point_of.ravel()], np.int64)
 
 
 def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:

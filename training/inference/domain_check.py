@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from datagen.common.arrays import Floats
 from datagen.common.errors import DsffnetError
-from datagen.mesh.geometry import Mesh, bounding_box, edges_of
+from datagen.mesh.geometry import InFaces, Mesh, bounding_box, edges_of, places_of
 from training.inference.orientation import POOR_ERROR, TURN, Axes, Orientation, axes_as_options
 from training.inference.standing import MISREAD, Standing
 from training.tracking.provenance import FILE, Provenance, provenance_of
@@ -140,6 +140,15 @@ def remarks(
         yield from _about_count(name, len(upright), seen)
 
 
+def about_loose(loose: NDArray[np.integer], *, name: str) -> str:
+    """Return what to say of vertices [n], by number, of a mesh called ``name`` that are in no face."""
+    are = "is 1 vertex" if len(loose) == 1 else f"are {len(loose):,} vertices"
+    return (
+        f"in {name} {are} in no face (number {loose[0]}{' the first' if len(loose) > 1 else ''}, counted from 0): not "
+        "read, and moved as the nearest that is in one"
+    )
+
+
 class Tears:
     """Finds edges of a target that transfers pull across the body, as they do a skirt's; not gaps at doubled vertices.
 
@@ -150,7 +159,7 @@ class Tears:
     def __init__(self, target: Mesh) -> None:
         self._edges = edges_of(target.faces)
         self._before = np.maximum(self._lengths(target), 1e-12)
-        self._size = float(np.ptp(target.vertices, axis=0).max())
+        self._size = float(np.ptp(InFaces(target).mesh.vertices, axis=0).max())
 
     def _lengths(self, mesh: Mesh) -> Floats:
         ends = mesh.vertices[self._edges].astype(np.float64)
@@ -197,7 +206,7 @@ def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, A
 
 def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
     sizes = part_sizes(mesh)
-    if sizes[0] < _MAIN_SHARE * sizes.sum():
+    if sizes[0] <= _MAIN_SHARE * sizes.sum():
         yield (
             f"{name} has {len(sizes)} separate parts, the largest with {sizes[0] / sizes.sum():.0%} of the vertices: "
             "one body is posed as a whole; save it by itself, or choose it by --source-geometry or --target-geometry "
@@ -207,9 +216,9 @@ def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
 
 def part_sizes(mesh: Mesh) -> NDArray[np.int64]:
     """Vertices in each connected part, most first; vertices at one place count as one, as at the seams of textures."""
-    points, point_of = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    edges = edges_of(point_of.ravel()[mesh.faces])
-    links = csr_matrix((np.ones(len(edges)), edges.T), shape=(len(points), len(points)))
+    place_of = places_of(mesh.vertices)
+    edges, count = edges_of(place_of[mesh.faces]), int(place_of.max()) + 1
+    links = csr_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
     return np.sort(np.bincount(connected_components(links, directed=False)[1]))[::-1]
 
 

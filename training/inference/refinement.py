@@ -13,7 +13,7 @@ from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import Mesh, edges_of
+from datagen.mesh.geometry import Mesh, edges_of, places_of
 
 _STEPS = 8
 
@@ -21,8 +21,8 @@ _STEPS = 8
 class Refinement:
     """What keeps the edges of one target, to be used for any number of outputs.
 
-    Vertices at the same place of the target (the seams of a texture, which some formats store as several vertices)
-    are one point here, so that no seam opens.
+    Vertices at the same place of the target (:func:`datagen.mesh.geometry.places_of`) are one point here, so that no
+    seam opens.
     """
 
     def __init__(self, target: Mesh, *, weight: float, steps: int = _STEPS) -> None:
@@ -31,8 +31,9 @@ class Refinement:
         It is w for a thousand points: w grows with their number, for edges shorten as points grow more, and the same
         dent then spreads over more of them.
         """
-        points, self._point_of = np.unique(target.vertices, axis=0, return_inverse=True)
-        self._point_of = self._point_of.ravel()
+        self._point_of = places_of(target.vertices)
+        self._members = np.bincount(self._point_of)[:, None]
+        points = self._of_points(target.vertices)
         edges = edges_of(self._point_of[target.faces])
         edges = edges[edges[:, 0] != edges[:, 1]]
         self._both = np.concatenate([edges, edges[:, ::-1]])
@@ -40,15 +41,17 @@ class Refinement:
         self._gather = _sums_of_rows(self._both[:, 0], len(points))
         self._weight, self._steps = weight * len(points) / 1000, steps
         self._solve = splu(_matrix(self._both, len(points), self._weight)).solve
-        self._members = np.bincount(self._point_of, minlength=len(points))[:, None]
 
     def __call__(self, output: Floats) -> NDArray[np.float64]:
         """The output [n, 3], in the target's unit and vertex order, with the target's edges."""
-        goal = _sums_of_rows(self._point_of, len(self._members)) @ output / self._members
-        found = goal
+        found = goal = self._of_points(output)
         for _ in range(self._steps):
             found = self._solve(goal + self._weight * self._pulled(found))
         return np.asarray(found[self._point_of])
+
+    def _of_points(self, vertices: Floats) -> Floats:
+        """The mean [point, 3] of the vertices [n, 3] of each point."""
+        return np.asarray(_sums_of_rows(self._point_of, len(self._members)) @ vertices / self._members)
 
     def _pulled(self, vertices: Floats) -> Floats:
         """What the turned edges of the target add to the right side of the system [point, 3]."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datagen.common.arrays import Floats
-from datagen.mesh.geometry import Mesh, bounding_box, check_mesh, standing_point
+from datagen.mesh.geometry import InFaces, Mesh, bounding_box, check_mesh, standing_point
 from training.inference.mesh_reading import (
     device_of,
     has_points,
@@ -94,7 +94,7 @@ class PoseTransfer:
         Parameters
         ----------
         source, target
-            Meshes that may differ in vertices, faces, size and position.
+            Meshes that may differ in vertices, faces, size and position. Vertices in no face are not read.
         source_axes, target_axes
             How each of them stands; by default as the network finds, where it can (`finds_standing`), else as the
             training data does, Y up and facing +Z.
@@ -106,7 +106,8 @@ class PoseTransfer:
         -------
         Mesh
             The target's faces, and its vertices moved, in the target's order, axes and unit: edges keep the length that
-            they have in the target (median over edges), and it stands where the target stands.
+            they have in the target (median over edges), and it stands where the target stands. Vertices in no face move
+            as the nearest one does that is in some.
 
         Raises
         ------
@@ -148,7 +149,8 @@ class PoseTransfer:
         MeshError
             While iterating: a mesh cannot be used.
         """
-        check_mesh(target, name="target")
+        whole, seen = target, InFaces.checked(target, name="target")
+        target = seen.mesh
         target_axes = _as_told(target_axes) or self.standing(target.vertices)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
         frames = self._frames(sources, _as_told(source_axes), upright, target_axes)
@@ -163,7 +165,7 @@ class PoseTransfer:
             refinement = Refinement(upright, weight=refine)
         for vertices in frames:
             finished = refinement(vertices) if refinement else vertices
-            yield Mesh(target_axes.restored(finished), target.faces)
+            yield Mesh(seen.of_all(target_axes.restored(finished)), whole.faces)
 
     def unplaced(self, source: Mesh, target: Mesh) -> NDArray[np.float64]:
         """Posed vertices [n_target, 3] in the normalised box, of meshes that are usable and stand upright."""
@@ -247,7 +249,7 @@ class PoseTransfer:
         own = target.vertices @ self._turned_round(target.vertices, target_axes)  # its lean is of its pose, and goes
         posed = self._poser(Mesh(own, target.faces))
         for number, source in enumerate(sources):
-            mesh = check_mesh(source, name=f"source {number}")
+            mesh = InFaces.checked(source, name=f"source {number}").mesh
             if number == 0:  # the others may turn round and bend
                 axes = axes or self.standing(mesh.vertices)
             assert axes is not None

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, storage_errors
 from datagen.mesh.files import MeshFile, write_posed
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import InFaces, Mesh
 from datagen.mesh.sequences import require_animation, write_animation
-from training.inference.domain_check import Tears, remarks, seen_by
+from training.inference.domain_check import Tears, about_loose, remarks, seen_by
 from training.inference.orientation import UPRIGHT, Axes, orientation
 from training.inference.standing import MISREAD, Standing
 from training.inference.transfer import REFINE_WEIGHT, PoseTransfer
@@ -52,7 +52,8 @@ class TransferWork:
         """``first`` is the source, or the first frame of a sequence; ``by``: weights that were chosen; ``known``: what
         comes of the first, neither smoothed nor refined, where it is known.
         """
-        self.job, self.transfer, self.first, self.target = job, transfer, first, target
+        self.job, self.transfer, self.first, self.target = job, transfer, InFaces(first).mesh, target
+        self._seen = InFaces(target.mesh)
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
         self.by, self._known, self._warn = by, known, warn
         self._shown: dict[int, Mesh] = {}
@@ -80,11 +81,17 @@ class TransferWork:
         MeshError
             Of weights to choose from: one of the meshes is a person and one an animal, and it is not forced.
         """
-        meshes = first, target.mesh
+        seen = InFaces(first), InFaces(target.mesh)
+        for path, each in zip((job.sources[0], job.target), seen, strict=True):
+            if len(each.loose):
+                warn(about_loose(each.loose, name=str(path)))
+        meshes = seen[0].mesh, seen[1].mesh
         if weights is None:
             found = chosen(job, meshes, force=force, load=load)
-            by = found.weights.name
-            work = cls(job, found.transfer, first=first, target=target, by=by, known=found.posed, warn=warn)
+            by, known = found.weights.name, found.posed
+            if known is not None and len(seen[1].loose):
+                known = Mesh(seen[1].of_all(known.vertices), target.mesh.faces)
+            work = cls(job, found.transfer, first=first, target=target, by=by, known=known, warn=warn)
             work._take(found.standings, found.weights, found.doubts)
             return work
         transfer = (load or PoseTransfer.from_run)(weights, project=job.project)
@@ -94,7 +101,7 @@ class TransferWork:
         else:
             work._settle_axes(weights)
         if job.project:
-            upright = Mesh(work.axes[1].turned(target.mesh.vertices), target.mesh.faces)
+            upright = Mesh(work.axes[1].turned(meshes[1].vertices), meshes[1].faces)
             if not work.transfer.rest_error(upright) <= MISREAD:
                 warn(f"{job.target} is no body that {name_of(job.project)} knows: what it takes for parts may be none")
         return work
@@ -102,10 +109,10 @@ class TransferWork:
     def _settle_axes(self, weights: Path) -> None:
         """Find how the meshes stand where that is asked, and warn where they are unlike the training data."""
         errors = self.transfer.self_errors
-        ways = [orientation(errors, meshes) for meshes in (self._votes(), [self.target.mesh.vertices])]
+        ways = [orientation(errors, meshes) for meshes in (self._votes(), [self._seen.mesh.vertices])]
         self.axes = taken = self.job.axes or (ways[0].axes, ways[1].axes)
         seen = seen_by(weights)
-        meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
+        meshes = (self.job.sources[0], self.first), (self.job.target, self._seen.mesh)
         for (path, mesh), axes, way in zip(meshes, taken, ways, strict=True):
             both = ways[0].axes, ways[1].axes
             if self.job.axes is None and not way.is_certain:
@@ -118,7 +125,7 @@ class TransferWork:
     def _take(self, found: Pair, weights: Path, doubts: tuple[str, str] = ("", "")) -> None:
         """Turn the meshes as they were found to stand; warn of those that the network does not know."""
         self.axes, seen, stated = found, seen_by(weights), self.job.is_told
-        meshes = (self.job.sources[0], self.first), (self.job.target, self.target.mesh)
+        meshes = (self.job.sources[0], self.first), (self.job.target, self._seen.mesh)
         for (path, mesh), axes, doubt in zip(meshes, found, doubts, strict=True):
             for line in remarks(
                 mesh, name=str(path), axes=axes, way=None, both=None, stated=stated, seen=seen, doubt=doubt
@@ -140,7 +147,7 @@ class TransferWork:
         return [self.first.vertices, *(self._source(number).vertices for number in sorted(others))]
 
     def _source(self, number: int) -> Mesh:
-        return self.first if number == 0 else self.job.read_source(number).mesh
+        return self.first if number == 0 else InFaces(self.job.read_source(number).mesh).mesh
 
     def _write_pair(self) -> str:
         job, posed = self.job, next(self._kept())
@@ -215,9 +222,10 @@ class TransferWork:
             frames = bar(frames, total=count, what="transfer", unit="frame")
         for number, posed in enumerate(frames):
             if number in kept:
-                self._shown[number] = posed
+                self._shown[number] = Mesh(posed.vertices[self._seen.rows], self._seen.mesh.faces)
             if number in played:
-                self._played[number] = Mesh(posed.vertices.astype(np.float32), posed.faces)
+                seen = posed.vertices[self._seen.rows]
+                self._played[number] = Mesh(seen.astype(np.float32), self._seen.mesh.faces)
             yield posed
 
     @cached_property
@@ -239,7 +247,7 @@ class TransferWork:
         from training.viz.transfer_example import PANEL, shown
         from training.viz.viewer import write_viewer
 
-        job, target = self.job, self._upright_target(self.target.mesh, self.job.target)
+        job, target = self.job, self._upright_target(self._seen.mesh, self.job.target)
         if job.picture or not job.is_sequence:
             rows = [
                 shown(self._upright_source(number), target, self._upright_target(posed, self._place(number)))

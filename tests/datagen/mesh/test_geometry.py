@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from datagen.common.errors import MeshError, StorageError
 from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.formats import FORMATS
-from datagen.mesh.geometry import Mesh, bounding_box, bounds, check_mesh, edges_of
+from datagen.mesh.geometry import InFaces, Mesh, bounding_box, bounds, check_mesh, edges_of, places_of
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -33,6 +33,37 @@ def test_normalisation_of_the_tetrahedron_by_hand() -> None:
 
 def test_edges_are_unique_and_sorted() -> None:
     assert edges_of(TETRAHEDRON.faces).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+
+
+def test_vertices_in_no_face_are_left_out_and_move_as_the_nearest_does() -> None:
+    loose = np.array([[0.0, 0, 3.5], [7, 7, 7]])
+    vertices = np.concatenate([loose[:1], TETRAHEDRON.vertices, loose[1:]])
+    flat = [[5, 1, 1]]  # no triangle: its corner is in no face
+    found = InFaces(Mesh(vertices, np.concatenate([TETRAHEDRON.faces + 1, flat])))
+    assert found.loose.tolist() == [0, 5] and np.array_equal(found.mesh.vertices, TETRAHEDRON.vertices)
+    assert np.array_equal(found.mesh.faces, TETRAHEDRON.faces)
+    moved = found.of_all(TETRAHEDRON.vertices * (1, 1, 2))
+    assert np.allclose(moved[1:5], TETRAHEDRON.vertices * (1, 1, 2)) and np.allclose(moved[0], [0, 0, 6.5])
+
+
+@pytest.mark.parametrize("faces", [TETRAHEDRON.faces, np.zeros((1, 3), np.int64), np.zeros((0, 3), np.int64)])
+def test_of_a_mesh_without_loose_vertices_and_of_points_nothing_is_left_out(faces: np.ndarray) -> None:
+    mesh = Mesh(TETRAHEDRON.vertices, faces)
+    found = InFaces(mesh)
+    assert found.mesh is mesh and not len(found.loose) and found.of_all(mesh.vertices) is mesh.vertices
+
+
+def test_a_mesh_that_is_nothing_without_its_loose_vertices_is_refused() -> None:
+    point = np.concatenate([np.repeat(TETRAHEDRON.vertices[:1], 3, axis=0), TETRAHEDRON.vertices[1:]])
+    with pytest.raises(MeshError, match="A has no extent"):
+        InFaces.checked(Mesh(point, np.array([[0, 1, 2]])), name="A")
+
+
+def test_vertices_at_one_place_but_for_rounding_share_its_number() -> None:
+    vertices = np.concatenate([TETRAHEDRON.vertices, TETRAHEDRON.vertices[2:] + 2e-6, TETRAHEDRON.vertices[:1] + 1e-3])
+    first, second, third, fourth, *others = places_of(vertices).tolist()
+    assert len({first, second, third, fourth}) == 4 and others[:2] == [third, fourth]
+    assert others[2] not in (first, second, third, fourth)
 
 
 @pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".stl"}))

@@ -86,6 +86,8 @@ def test_two_bodies_in_one_file() -> None:
     vertices = np.concatenate([GRID, GRID + 3, GRID - 3])
     three = Mesh(vertices, np.concatenate([STRIP, STRIP + 240, STRIP + 480]))
     assert "A has 3 separate parts, the largest with 33% of the vertices" in told(three, seen=None)
+    two = Mesh(vertices[:480], three.faces[: 2 * len(STRIP)])
+    assert "A has 2 separate parts, the largest with 50% of the vertices" in told(two, seen=None)
 
 
 def test_a_stray_vertex_and_a_lost_axis() -> None:

@@ -36,7 +36,8 @@ def transfer() -> PoseTransfer:
 
 def mesh_of(seed: int, count: int = 40) -> Mesh:
     random = np.random.default_rng(seed)
-    return Mesh(random.normal(size=(count, 3)) * (1, 2, 0.7), random.integers(0, count, (60, 3)))
+    vertices, some = random.normal(size=(count, 3)) * (1, 2, 0.7), random.integers(0, count, (60, 3))
+    return Mesh(vertices, np.concatenate([some, np.arange(count)[:, None] + np.arange(3)]) % count)
 
 
 def test_a_sequence_of_one_is_a_call(transfer: PoseTransfer) -> None:
@@ -147,6 +148,26 @@ def test_refining_changes_the_output_and_nothing_else(transfer: PoseTransfer) ->
     assert abs(plain.vertices - refined.vertices).max() > 1e-3 and np.array_equal(refined.faces, target.faces)
 
 
+@pytest.mark.parametrize("network", ["parts", "dsffnet"])
+@pytest.mark.parametrize("first", [True, False])
+def test_vertices_in_no_face_change_nothing_and_move_as_the_nearest_one_does(network: str, *, first: bool) -> None:
+    transfer = PoseTransfer(lively(network))
+
+    def with_loose(mesh: Mesh, places: np.ndarray) -> Mesh:
+        vertices = [places, mesh.vertices] if first else [mesh.vertices, places]
+        return Mesh(np.concatenate(vertices), mesh.faces + len(places) * first)
+
+    source, target = mesh_of(1), mesh_of(2)
+    plain = transfer(source=source, target=target, refine=1.0)
+    beside = target.vertices[7] + (0, -0.01, 0)
+    whole = with_loose(target, np.array([beside, beside]))
+    found = transfer(source=with_loose(source, np.array([[0, 90.0, 0]])), target=whole, refine=1.0)
+    own, loose = (found.vertices[2:], found.vertices[:2]) if first else (found.vertices[:-2], found.vertices[-2:])
+    np.testing.assert_array_equal(own, plain.vertices)
+    np.testing.assert_allclose(loose - beside, np.broadcast_to(plain.vertices[7] - target.vertices[7], (2, 3)))
+    assert np.array_equal(found.faces, whole.faces)
+
+
 def test_a_broken_frame_is_named(transfer: PoseTransfer) -> None:
     broken = Mesh(np.full((4, 3), np.nan), FACES[:1])
     frames = transfer.sequence([mesh_of(1), broken], mesh_of(2))
@@ -195,7 +216,7 @@ def test_a_hundred_frames_take_no_more_memory_than_ten() -> None:
 
     def peak(count: int) -> int:
         random = np.random.default_rng(0)
-        frames = (Mesh(random.normal(size=(3000, 3)), FACES) for _ in range(count))
+        frames = (Mesh(random.normal(size=(3000, 3)), target.faces) for _ in range(count))
         tracemalloc.start()
         try:
             for _ in PoseTransfer(Copier()).sequence(frames, target, smooth=5):

@@ -75,6 +75,18 @@ def test_a_pair_with_picture_and_page(
     assert np.allclose(load_mesh(tmp_path / "posed.obj").vertices, expected.vertices, atol=1e-5)
 
 
+def test_a_vertex_in_no_face_is_told_of_and_kept(
+    transfer: Transfer, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    transfer("pose.obj", "person.obj", "-o", tmp_path / "plain.obj")
+    loose = tmp_path / "loose.obj"
+    loose.write_text((run.parent / "person.obj").read_text() + "\nv 9 9 9\n")
+    transfer("pose.obj", loose, "-o", tmp_path / "posed.obj", "--picture")
+    assert "loose.obj is 1 vertex in no face (number 32, counted from 0)" in capsys.readouterr().err
+    plain, posed = (load_mesh(tmp_path / name).vertices for name in ("plain.obj", "posed.obj"))
+    assert len(posed) == 33 and np.allclose(posed[:-1], plain, atol=1e-6) and posed[-1].min() > 5
+
+
 def test_files_of_any_name_are_taken_drawn_and_said(
     transfer: Transfer, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -365,7 +377,6 @@ ODD: dict[str, tuple[NDArray[np.floating], NDArray[np.integer]]] = {
     "vertices of no face": (np.concatenate([ROUND, 1.1 * ROUND, 1.2 * ROUND]), TRIANGLES),
     "faces without area": (np.concatenate([ROUND, ROUND[[0, 0, 0]]]), np.concatenate([TRIANGLES, [[42, 43, 44]]])),
     "no face with an area": (ROUND, np.array([[0, 1, 0], [1, 1, 2]])),
-    "one face": (ROUND, TRIANGLES[:1]),
     "inside out": (ROUND, TRIANGLES[:, ::-1]),
     "four faces at an edge": (ROUND, np.concatenate([TRIANGLES, [[0, 1, 20], [0, 1, 30]]])),
     "far away": (ROUND + 1e7, TRIANGLES),
@@ -375,6 +386,7 @@ ODD: dict[str, tuple[NDArray[np.floating], NDArray[np.integer]]] = {
 UNUSABLE: dict[str, tuple[NDArray[np.floating], NDArray[np.integer], str]] = {
     "not a number": (np.where(np.arange(COUNT)[:, None] == 5, np.nan, ROUND), TRIANGLES, "the first is number 5"),
     "infinite": (np.where(np.arange(COUNT)[:, None] == 5, np.inf, ROUND), TRIANGLES, "the first is number 5"),
+    "one face, and points": (ROUND, TRIANGLES[:1], "all vertices lie in one slanted plane"),
     "a face beyond the last vertex": (ROUND, np.array([[0, 1, 99]]), "vertex 100, but there are 42"),
     "too large to be squared": (ROUND * 1e200, TRIANGLES, r"coordinates up to 1e\+200: scale it"),
     "too small to be squared": (ROUND * 1e-200, TRIANGLES, "long at most: scale it"),
