@@ -1,5 +1,6 @@
 """Importing meshes that exist already: a recipe for each layout, and published lists of evaluation triples."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -74,11 +75,13 @@ def _ragged(meshes: FoundMeshes) -> tuple[FoundMeshes, Counts]:
     """Identities with fewer poses, then those with all; the poses that all have, then the others."""
     whole = [identity for identity in meshes.identities if len(meshes.poses_of(identity)) == len(meshes.poses)]
     fewer = [identity for identity in meshes.identities if identity not in whole]
-    common = meshes.poses_of(fewer[0])
-    if len(fewer) < 2 or not whole or any(meshes.poses_of(identity) != common for identity in fewer):
-        identity = meshes.identities.index(fewer[0])
-        pose = next(n for n, name in enumerate(meshes.poses) if name not in common)
-        meshes.path(identity, pose)  # raises, naming the file
+    common = list(Counter(tuple(meshes.poses_of(identity)) for identity in fewer).most_common(1)[0][0])
+    odd = [identity for identity in fewer if meshes.poses_of(identity) != common]
+    if len(fewer) < 2 or not whole or odd:
+        lacking = (odd or fewer)[0]
+        there, expected = meshes.poses_of(lacking), common if odd else meshes.poses
+        missing = [pose for pose in (*expected, *meshes.poses) if pose not in there]
+        meshes.path(meshes.identities.index(lacking), meshes.poses.index(missing[0]))  # raises, naming the file
     others = [pose for pose in meshes.poses if pose not in common]
     ordered = replace(meshes, identities=(*fewer, *whole), poses=(*common, *others))
     return ordered, (len(fewer), len(whole), len(common), len(others))

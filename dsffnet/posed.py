@@ -134,7 +134,7 @@ def _job(read: list[MeshFile], options: Options) -> TransferJob:
         target=read[1].path,
         out=Path(),
         is_sequence=False,
-        axes=None if options.align else axes_of_both(options.up or "Y", options.front or "Z"),
+        axes=None if options.align else axes_of_both(options.up, options.front),
         is_told=bool(options.up or options.front),
         refine=options.refine,
     )

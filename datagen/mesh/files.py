@@ -215,14 +215,16 @@ def _write_beside(out: Path, name: str, content: bytes) -> bool:
     return True
 
 
-def draft_of(original: MeshFile) -> "Draft":
-    """Return the original as a GLB file that lacks only its positions."""
+def draft_of(original: MeshFile) -> tuple["Draft", list[str]]:
+    """Return the original as a GLB file that lacks only its positions, and what has no place there, a line each."""
     from datagen.mesh.formats.glb import GlbContent
     from datagen.mesh.formats.glb_export import built_draft
 
-    if isinstance(original.content, GlbContent):
-        return original.content.draft()
-    return built_draft(original.content.surface, len(original.mesh.vertices), original.name)[0]
+    content = original.content
+    if isinstance(content, GlbContent):
+        return content.draft(), content.lost
+    draft, left_out = built_draft(content.surface, len(original.mesh.vertices), original.name)
+    return draft, [*left_out, *content.only_here]
 
 
 def check_writable(out: Path) -> None:

@@ -219,7 +219,11 @@ def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
         raise MeshError(f"{name} has faces of shape {faces.shape}, not triangles [f, 3]: triangulate it")
     wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(wrong):
-        raise MeshError(f"{name}: {len(wrong)} vertices are not finite, the first is number {wrong[0]}")
+        are = "1 vertex is" if len(wrong) == 1 else f"{len(wrong):,} vertices are"
+        raise MeshError(
+            f"{name}: {are} not finite, the first is number {wrong[0]}, counted from 0, at "
+            f"{vertices[wrong[0]].tolist()}. Repair or remove it"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{name}: faces name vertex {faces.max()}, but there are {len(vertices)}")
     _require_extent(vertices, name)

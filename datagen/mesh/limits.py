@@ -179,7 +179,7 @@ def _nearest_beside(path: Path) -> str:
     """Words that suggest the mesh file of the folder whose name is nearest, or none."""
     names = dict[str, Path]()
     with contextlib.suppress(OSError, ValueError):
-        names = {each.stem: each for each in path.parent.iterdir() if each.suffix.lower() in FORMATS}
+        names = {each.stem: each for each in path.parent.iterdir() if each.suffix.lower() in FORMATS and each.exists()}
     close = difflib.get_close_matches(path.stem, names, n=1)
     return f", did you mean {names[close[0]]}?" if close else ""
 

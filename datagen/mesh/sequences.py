@@ -66,7 +66,7 @@ def require_animation(original: MeshFile, frames: int) -> None:
     """
     if frames > FRAME_LIMIT:
         raise MeshError(f"{frames:,} frames are more than {FRAME_LIMIT:,}: an animated GLB of so many plays nowhere")
-    size = frames * draft_of(original).frame_bytes
+    size = frames * draft_of(original)[0].frame_bytes
     if size > GLB_LIMIT:
         raise MeshError(f"{frames:,} frames of {original.path} need {size:,} bytes, an animated GLB holds 4 GiB")
 
@@ -77,7 +77,7 @@ def write_animation(
     out: Path,
     *,
     frames_per_second: float,
-) -> None:
+) -> list[str]:
     """Write frames [frame, n, 3] of a mesh as one GLB with an animation; the file appears whole or not at all.
 
     Frame k is a morph target, the difference from frame 0, and shows alone at k / ``frames_per_second`` seconds;
@@ -88,6 +88,11 @@ def write_animation(
 
     At most 2,000 frames and 4 GiB. Players keep all morph targets in a texture of the graphics card; WebGL promises
     room for 256 of them, usual cards have 2,048.
+
+    Returns
+    -------
+    list of str
+        What of the original is not in it, a line each.
 
     Raises
     ------
@@ -104,4 +109,6 @@ def write_animation(
         raise MeshError(f"frames per second must be above 0, not {frames_per_second}")
     check_writable(out)
     sound = (usable(original, frame) for frame in frames)
-    draft_of(original).animated(sound, out, frames_per_second=frames_per_second)
+    draft, left_out = draft_of(original)
+    draft.animated(sound, out, frames_per_second=frames_per_second)
+    return left_out

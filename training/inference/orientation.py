@@ -96,14 +96,18 @@ EVERY_AXES = (
 """The 24 ways to stand along the axes; the training data's first."""
 
 
-def axes_of_both(up: str, front: str) -> tuple[Axes, Axes]:
+def axes_of_both(up: str | None, front: str | None) -> tuple[Axes, Axes]:
     """Axes of source and target from names such as ``Z`` (of both) or ``Z,Y`` (of the source, of the target).
+
+    Without ``up`` that is Y; without ``front`` that is Z, or -Y where Z is up, as in Blender.
 
     Raises
     ------
     RecipeError
         A name is no axis, or there are more than two.
     """
+    up = up or UPRIGHT.up
+    front = front or ",".join("-Y" if name[-1:] == "Z" else UPRIGHT.front for name in up.upper().split(","))
     ups, fronts = (names.upper().split(",") for names in (up, front))
     if max(len(ups), len(fronts)) > 2:
         raise RecipeError(f"--up={up} --front={front}: name one axis, or two with a comma, of source and target")

@@ -1,6 +1,7 @@
 """What ``dsffnet transfer`` is asked for, in paths and numbers, and whether its places can be written."""
 
 import argparse
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -10,11 +11,15 @@ from pathlib import Path
 from datagen.characters.motion import Motion
 from datagen.common.errors import MeshError, RecipeError
 from datagen.mesh.files import MeshFile, check_writable, read_mesh_file
+from datagen.mesh.formats import FORMATS
 from datagen.mesh.sequences import frames_of, is_pattern
 from training.inference.orientation import UPRIGHT, Axes, axes_of_both
 from workflows.pipeline.weights_argument import projecting
 
 _ANIMATED = ".glb"
+_FEWEST_SMOOTHED = 4
+_OF_OTHERS = (".gltf", ".fbx", ".abc", ".usd", ".usdz", ".bvh", ".mp4", ".mov", ".gif", ".zip")
+"""Of files that others write frames into, which are not written here."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class TransferJob:
             )
         if options.project and not options.model:
             raise RecipeError("--project is for outputs of a network that is named: add --model, or leave it out")
-        of_source, of_target = axes_of_both(options.up or UPRIGHT.up, options.front or UPRIGHT.front)
+        of_source, of_target = axes_of_both(options.up, options.front)
         return cls(
             sources=frames_of(source) if is_of_files else [source],
             target=target,
@@ -144,12 +149,12 @@ class TransferJob:
         StorageError
             A place cannot be written.
         """
-        read = {path.resolve() for path in (*self.sources, self.target)}
+        read = {os.path.realpath(path) for path in (*self.sources, self.target)}
         outputs = self.outputs
         folder = next((path for path in self.drawn if path.is_dir()), None)
         if folder is not None:
             raise MeshError(f"{folder} is a folder, where --picture or --viewer would write; choose another --out")
-        taken = next((path for path in outputs if path.resolve() in read), None)
+        taken = next((path for path in outputs if os.path.realpath(path) in read), None)
         if taken is not None:
             raise MeshError(f"{taken} is one of the meshes to read, which are never written over; choose another --out")
         if len(set(outputs)) < len(outputs):
@@ -158,6 +163,11 @@ class TransferJob:
             check_writable(self.out)
         elif self.out.exists() and not self.out.is_dir():
             raise MeshError(f"{self.out} is a file; frames go into a folder, or into one .glb")
+        elif not self.out.exists() and self.out.suffix.lower() in (*FORMATS, *_OF_OTHERS):
+            raise MeshError(
+                f"{self.out}: frames go into a folder or into one .glb, not into one {self.out.suffix}; choose "
+                f"--out {self.out.with_suffix(_ANIMATED)} or --out {self.out.with_suffix('')}"
+            )
         else:
             # not yet the folder itself: it appears when the last frame is done
             check_writable((self.out if self.out.is_dir() else self.out.parent) / self.animated.name)
@@ -200,4 +210,7 @@ def _frames_of_window(word: str, fps: float) -> int:
     found = re.fullmatch(r"(\d+)|(\d*\.?\d+)\s*s", word.strip())
     if found is None:
         raise RecipeError(f"--smooth {word!r} is neither a number of frames such as 7 nor a time such as 0.2s")
-    return int(found[1]) if found[1] else round(float(found[2]) * fps)
+    frames = int(found[1]) if found[1] else round(float(found[2]) * fps)
+    if frames < _FEWEST_SMOOTHED and float(found[1] or found[2]) > 0:
+        raise RecipeError(f"--smooth {word!r} takes {frames} frames: fewer than {_FEWEST_SMOOTHED} smooth nothing")
+    return frames

@@ -173,7 +173,9 @@ class TransferWork:
 
     def _animate(self, frames: Iterable[Mesh], out: Path) -> None:
         vertices = (frame.vertices for frame in frames)
-        write_animation(self.target, vertices, out, frames_per_second=self.job.fps)
+        left_out = write_animation(self.target, vertices, out, frames_per_second=self.job.fps)
+        if left_out and self.job.is_file:  # of frames in files, these say it, or have it
+            warn(f"{out.name} does not keep: {'; '.join(left_out)}")
 
     def _saved(self, folder: Path) -> Iterator[Mesh]:
         """The frames, each written to its file as it passes."""

@@ -273,10 +273,11 @@ class GlbContent(Alone):
         ]
         rich = any(set(m) - known or set(m.get("pbrMetallicRoughness", {})) - plain for m in materials)
         names = ["names of its geometries"] if len(self.geometries) > 1 else []
-        return [*self._lost, *names, *(["material properties beyond base colour and its texture"] if rich else [])]
+        return [*self.lost, *names, *(["material properties beyond base colour and its texture"] if rich else [])]
 
     @property
-    def _lost(self) -> list[str]:
+    def lost(self) -> list[str]:
+        """What of the file is in none that is written of it."""
         others = {name: node for name, node in solid_nodes(self._file).items() if node not in self._nodes}
         hidden = set(others.values())
         parts = {
@@ -295,7 +296,7 @@ class GlbContent(Alone):
 
     def rewritten(self, vertices: NDArray[np.float64]) -> Encoded:
         """Return the file with other positions and normals, without what moved it before."""
-        return Encoded(self.draft().static(vertices), {}, self._lost)
+        return Encoded(self.draft().static(vertices), {}, self.lost)
 
     def draft(self) -> Draft:
         """Return the file without positions and normals of the mesh, to be filled in."""

@@ -30,6 +30,7 @@ _PATTERNS = {
     (0, 2): re.compile(rb"\s*f(?:\s+-?\d+//-?\d+)+\s*"),
     (0, 1, 2): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+/-?\d+)+\s*"),
 }
+_FACE = re.compile(rb"\s*f(?:\s+-?\d+(?:/-?\d*){0,2})*\s*")
 _SECTIONS = (b"o", b"g")
 _ELEMENTS = (b"v", b"vt", b"vn", b"f", b"usemtl", b"mtllib", b"o", b"g", b"s", b"l", b"p")
 
@@ -137,7 +138,12 @@ class ObjContent:
     @cached_property
     def _face_corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Numbers [corner, 3] of vertex, texture coordinate and normal (-1 for none), and corners of each face."""
-        table, sizes = _corners(self._of(b"f"))
+        try:
+            table, sizes = _corners(self._of(b"f"))
+        except ValueError:
+            wrong = next(n for n, line in enumerate(self._of(b"f")) if not _FACE.fullmatch(line.partition(b"#")[0]))
+            line = self._of(b"f")[wrong].decode("utf-8", "replace")
+            raise ValueError(f"line {self._at[b'f'][wrong] + 1} is no face: {line[:60]!r}") from None
         line_of = np.repeat(np.array(self._at[b"f"], np.int64), sizes)
         for column, element in enumerate((b"v", b"vt", b"vn")):
             before = np.searchsorted(np.array(self._at[element], np.int64), line_of)

@@ -87,7 +87,7 @@ def test_aligning_turns_each_mesh_as_it_is_found_to_stand(
 
 
 def test_unusable_input_is_one_clear_error(model: PoseTransferModel, folder: Path, arrays: dict[str, Any]) -> None:
-    with pytest.raises(MeshError, match="source: 1 vertices are not finite"):
+    with pytest.raises(MeshError, match="source: 1 vertex is not finite"):
         model.predict(None, arrays | {"source": np.where(np.arange(3) == 1, np.nan, arrays["source"][:1])})
     with pytest.raises(MeshError, match="target: faces name vertex"):
         model.predict(None, arrays | {"target_faces": arrays["target_faces"] + 1000})

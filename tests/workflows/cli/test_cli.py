@@ -133,7 +133,7 @@ def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) 
         )
 
     fails(transfer("none.obj"), 1, "no mesh file at", "none.obj")
-    fails(transfer("nan.obj"), 1, "nan.obj", "1 vertices are not finite")
+    fails(transfer("nan.obj"), 1, "nan.obj", "1 vertex is not finite")
     fails(transfer("points.obj"), 1, "points.obj holds 3 vertices and no faces")
     fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as GLB")
     fails(
