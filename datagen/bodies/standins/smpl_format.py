@@ -17,6 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from datagen.bodies.anny.model import AnnyModel
+from datagen.bodies.anny.rigs import Bones
 from datagen.bodies.smpl_family.model_file import NOTE, write_model
 from datagen.bodies.smpl_family.model_search import FAMILIES
 from datagen.bodies.smpl_family.smpl import joint_names
@@ -24,6 +25,7 @@ from datagen.bodies.standins.fit import fit_regressor, principal_shapes
 from datagen.bodies.standins.quadruped import quadruped
 from datagen.common.errors import BodyError
 from datagen.common.seeding import Stream, generator
+from datagen.mesh.rig import drivers_of
 from datagen.poses import JOINTS, PARENTS
 from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges
 
@@ -41,16 +43,6 @@ _ADULTS = PhenotypeRanges(
 """Narrow, as betas of +-4 standard deviations, which NPT draws, are to look human: statures are 1.82 +- 0.07 m."""
 
 _ANIMALS, _ANIMAL_SHAPES = 300, 41
-_BONES = (
-    "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase RightUpLeg RightLeg RightFoot RightToeBase Spine Spine1 Spine2 "
-    "LeftShoulder LeftArm LeftForeArm LeftHand {left} Neck Head RightShoulder RightArm RightForeArm RightHand {right}"
-)  # of Anny's Mixamo rig, in its order
-_FINGERS = ("Index", "Middle", "Pinky", "Ring", "Thumb")
-_CENTRE = {"pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck", "head": "Head"}
-_LIMBS = {
-    "hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase",
-    "collar": "Shoulder", "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand",
-}  # fmt: skip
 
 
 def write_standin(kind: StandInKind, out: Path, *, topology: AnnyTopology = "notoes_collapse10pc") -> Path:
@@ -97,8 +89,8 @@ def _person(kind: StandInKind, topology: AnnyTopology) -> dict[str, NDArray[Any]
     people = [body.t_pose(_identity(body, number)) for number in range(_PEOPLE)]
     vertices, heads = (np.stack(parts) for parts in zip(*people, strict=True))
     names = joint_names(kind)
-    carried = _by_joint(names)
-    joints = np.stack([heads[:, _pivots(name, carried[name])].mean(axis=1) for name in names], axis=1)
+    carried = _by_joint(body.bones, names)
+    joints = np.stack([heads[:, _pivots(name, carried)].mean(axis=1) for name in names], axis=1)
     bone_weights = scipy.sparse.csr_array(body.rest(_identity(body, 0)).weights).toarray()
     weights = np.stack([bone_weights[:, carried[name]].clip(0).sum(axis=1) for name in names], axis=1)
     faces = body.faces(_identity(body, 0))
@@ -148,35 +140,18 @@ def _identity(body: AnnyModel, number: int) -> NDArray[np.float64]:
     return body.draw_identity(generator(0, Stream.IDENTITY, number), number)
 
 
-def _by_joint(names: tuple[str, ...]) -> dict[str, list[int]]:
+def _by_joint(bones: Bones, names: tuple[str, ...]) -> dict[str, list[int]]:
     """Numbers of the bones that each joint carries: its own, and fingers that have no joint of theirs."""
-    fingers = {side: [f"{side}Hand{part}{n}" for part in _FINGERS for n in (1, 2, 3)] for side in ("Left", "Right")}
-    bones = _BONES.format(left=" ".join(fingers["Left"]), right=" ".join(fingers["Right"])).split()
-    carried: dict[str, list[int]] = {name: [] for name in names}
-    for number, bone in enumerate(bones):
-        carried[_joint_of(bone, names)].append(number)
-    return carried
+    hands = [label.partition("Hand") for label in bones.labels]
+    fingers = [f"{side}_{finger}".lower() for side, _, finger in hands]
+    named = [finger if finger in names else joint for finger, joint in zip(fingers, bones.joints, strict=True)]
+    drivers = drivers_of(named, bones.parents, names)
+    return {name: [bone for bone, its in enumerate(drivers) if its == joint] for joint, name in enumerate(names)}
 
 
-def _joint_of(bone: str, names: tuple[str, ...]) -> str:
-    centre = {bone: joint for joint, bone in _CENTRE.items()}
-    if bone in centre:
-        return centre[bone]
-    side = "left" if bone.startswith("Left") else "right"
-    part = bone[len(side) :]
-    limbs = {bone: joint for joint, bone in _LIMBS.items()}
-    if part in limbs:
-        return f"{side}_{limbs[part]}"
-    finger = f"{side}_{part.removeprefix('Hand').lower()}"
-    if finger in names:
-        return finger
-    return f"{side}_wrist" if "Thumb" in part else f"{side}_hand"
-
-
-def _pivots(name: str, bones: list[int]) -> list[int]:
+def _pivots(name: str, carried: dict[str, list[int]]) -> list[int]:
     """The bones in whose heads' middle a joint lies: its first; of a hand, the roots of its fingers."""
-    if not bones:
-        return [_by_joint(JOINTS)["head"][0]]  # jaw and eyes, which Anny's rig lacks
+    bones = carried[name] or carried["head"]  # jaw and eyes, which Anny's rig lacks
     return bones[::3] if name.endswith("_hand") else bones[:1]
 
 
