@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from datagen.common.errors import RecipeError, UnsafeFileError, reason_of
 from datagen.common.files import read_bounded
+from datagen.recipe.plain_yaml import load_yaml
 
 _LONGEST = 1_000_000
 """Bytes of a file; a sweep of a thousand trials has a tenth of them."""
@@ -42,9 +43,8 @@ def read_values(path: Path) -> Any:
     """
     try:
         content = read_bounded(path, limit=_LONGEST)
-        values = _parse_json(_decoded(content)) if path.suffix == ".json" else _parse_yaml(_decoded(content))
-    except ImportError as error:
-        raise RecipeError(f"{path} needs PyYAML, which is not installed here. Give it as JSON") from error
+        text = _decoded(content)
+        values = _parse_json(text) if path.suffix == ".json" else load_yaml(text, deepest=DEEPEST)
     except UnsafeFileError as error:
         raise RecipeError(str(error)) from error
     except OSError as error:
@@ -56,7 +56,7 @@ def read_values(path: Path) -> Any:
 
 
 def parse_words(words: Iterable[str], *, option: str = "") -> Words:
-    """Return the dotted key and the value of each word ``section.key=value``; values are YAML, or JSON without PyYAML.
+    """Return the dotted key and the value of each word ``section.key=value``; values are YAML.
 
     Parameters
     ----------
@@ -163,12 +163,6 @@ def _decoded(content: bytes) -> str:
         raise ValueError(f"not UTF-8 text (byte {content[error.start]:#04x} at {error.start:,})") from error
 
 
-def _parse_yaml(text: str) -> Any:
-    from datagen.recipe.plain_yaml import load_yaml
-
-    return load_yaml(text, deepest=DEEPEST)
-
-
 def _parse_json(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_unique)
@@ -191,22 +185,11 @@ def _parse_word(word: str, option: str) -> tuple[str, Any]:
     where = option.strip() or "override"
     require_plain({key: text}, where=where)
     try:
-        value = _parse_value(text)
+        value = load_yaml(text, deepest=DEEPEST)
     except ValueError as error:
         raise RecipeError(f"{option}{shown(word)} cannot be read: {_cut(str(error))}") from error
     require_plain({key: value}, where=where)
     return key, value
-
-
-def _parse_value(text: str) -> Any:
-    try:
-        return _parse_yaml(text)
-    except ImportError:
-        pass
-    try:
-        return _parse_json(text)
-    except json.JSONDecodeError:
-        return text
 
 
 def _set(values: Any, key: str, value: Any) -> Any:

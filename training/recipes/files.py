@@ -1,4 +1,4 @@
-"""Reading a training recipe from a file and words KEY=VALUE, on a machine that has only torch and pydantic."""
+"""Reading a training recipe from a file and words KEY=VALUE, without Ray and MLflow."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ def recipe_in(path: Path, words: Sequence[str] = ()) -> TrainingRecipe:
     Parameters
     ----------
     path
-        JSON, or YAML where its reader is installed: a training section, or a whole recipe (as ``dsffnet recipe``
+        YAML, or JSON by its ending: a training section, or a whole recipe (as ``dsffnet recipe``
         prints it), of which the section ``training`` is taken.
     words
         ``budget=9min``, ``network.name=npt``, ``training.steps=100``, see :func:`datagen.recipe.text.parse_words`.
