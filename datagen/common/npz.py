@@ -7,10 +7,10 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,21 +65,18 @@ def _require_short_directory(file: IO[bytes]) -> None:
         raise ValueError(f"its directory has {size:,} bytes, at most {_DIRECTORY:,} are read")
 
 
-def member_bytes(archive: zipfile.ZipFile, name: str, *, limit: int = LARGEST) -> bytes:
-    """Unpack a member, of whatever bytes it has no more than it declares.
+def read_arrays(
+    path: Path, names: tuple[str, ...], *, pickled: Callable[[str, BinaryIO], NDArray[Any]] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Those of the named arrays that an .npz holds. Its other arrays are not looked at.
 
-    Raises
-    ------
-    ValueError
-        It declares more than ``limit``, or is packed in another way than NumPy's.
-    """
-    member = _bounded(archive, name, limit)
-    with archive.open(member) as content:
-        return content.read(member.file_size)
-
-
-def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Those of the named arrays that an .npz holds; pickled ones are refused. Its other arrays are not looked at.
+    Parameters
+    ----------
+    path, names
+        The archive, and the arrays that are wanted.
+    pickled
+        Reads an array of Python objects, given its name and the file at the first byte of its pickle. Without it
+        such arrays are refused: NumPy's own reading runs what they say.
 
     Raises
     ------
@@ -92,10 +89,21 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         for name in names:
             if f"{name}.npy" in there:
                 left = LARGEST - sum(array.nbytes for array in found.values())
-                member_header(archive, f"{name}.npy")
-                content = io.BytesIO(member_bytes(archive, f"{name}.npy", limit=left))
-                found[name] = np.lib.format.read_array(content, allow_pickle=False)
+                _, kind = member_header(archive, f"{name}.npy")
+                content = io.BytesIO(_member_bytes(archive, f"{name}.npy", left))
+                if pickled and kind.hasobject:
+                    array_header(content)  # the pickle comes after it
+                    found[name] = pickled(name, content)
+                else:
+                    found[name] = np.lib.format.read_array(content, allow_pickle=False)
     return found
+
+
+def _member_bytes(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """Unpack a member, of whatever bytes it has no more than it declares."""
+    member = _bounded(archive, name, limit)
+    with archive.open(member) as content:
+        return content.read(member.file_size)
 
 
 def _bounded(archive: zipfile.ZipFile, name: str, limit: int) -> zipfile.ZipInfo:

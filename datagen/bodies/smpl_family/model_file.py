@@ -11,16 +11,16 @@ import io
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datagen.bodies.smpl_family.safe_pickle import unpickle
-from datagen.bodies.smpl_family.safe_pickle_arrays import array_of, require_size
+from datagen.bodies.smpl_family.safe_pickle_arrays import array_of
+from datagen.common import npz
 from datagen.common.errors import BodyError, reason_of
 from datagen.common.files import write_atomically
-from datagen.common.npz import FAULTS, LARGEST, array_header, member_bytes, member_header, opened
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 NOTE = "note"  # what a licence-free stand-in says of itself
@@ -65,7 +65,7 @@ def read_arrays(
 
 
 def _read_pickle(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    if path.stat().st_size > 2 * LARGEST:
+    if path.stat().st_size > 2 * npz.LARGEST:
         raise BodyError(f"{path} has more bytes than any body model; download it again")
     with open(path, "rb") as file:
         content = unpickle(file, name=str(path))
@@ -75,25 +75,15 @@ def _read_pickle(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 
 
 def _read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    try:
-        with opened(path) as archive:
-            there = set(archive.namelist())
-            members = [archive.getinfo(f"{key}.npy") for key in keys if f"{key}.npy" in there]
-            require_size(sum(member.file_size for member in members), name=str(path))
-            return {key: _read_member(archive, key, path) for key in keys if f"{key}.npy" in there}
-    except FAULTS as error:
-        raise BodyError(f"{path} is damaged ({reason_of(error)}); copy or download it again") from error
+    """Those of Python objects, as np.savez makes of a sparse matrix, go through our own unpickling."""
 
-
-def _read_member(archive: zipfile.ZipFile, key: str, path: Path) -> NDArray[Any]:
-    """One array; one of Python objects, as np.savez makes of a sparse matrix, goes through our own unpickling."""
-    _, kind = member_header(archive, f"{key}.npy")
-    content = io.BytesIO(member_bytes(archive, f"{key}.npy"))
-    if kind.hasobject:
-        array_header(content)  # the pickle comes after it
+    def recorded(key: str, content: BinaryIO) -> NDArray[Any]:
         return array_of(unpickle(content, name=f"{key!r} in {path}"), name=f"{key!r} in {path}")
-    content.seek(0)
-    return np.lib.format.read_array(content, allow_pickle=False)
+
+    try:
+        return npz.read_arrays(path, keys, pickled=recorded)
+    except npz.FAULTS as error:
+        raise BodyError(f"{path} is damaged ({reason_of(error)}); copy or download it again") from error
 
 
 def read_model(path: Path) -> ModelFile:

@@ -32,18 +32,6 @@ def array_of(value: Any, *, name: str) -> NDArray[Any]:
         raise BodyError(f"{name} is a damaged array ({error}); copy or download the file again") from error
 
 
-def require_size(size: int, *, name: str) -> None:
-    """Refuse an array of more bytes than any body model's.
-
-    Raises
-    ------
-    BodyError
-        With the size.
-    """
-    if size > _LARGEST:
-        raise BodyError(f"{name} is not of a body model: it would take {size / 2**30:.3g} GiB; download the file again")
-
-
 class _NotAnArrayError(Exception):
     pass
 
