@@ -161,11 +161,9 @@ def standing_point(vertices: Floats) -> NDArray[np.float64]:
 
 def vertex_normals(vertices: Floats, faces: Integers) -> NDArray[np.float64]:
     """Return area-weighted unit normals [v, 3]; a vertex without area points up."""
-    corners = vertices[faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], flat)
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    across = np.cross(second - first, third - first)
+    total = np.stack([np.bincount(faces.ravel(), np.repeat(axis, 3), len(vertices)) for axis in across.T], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.maximum(length, 1e-30), (0.0, 1.0, 0.0))
 

@@ -17,6 +17,7 @@ from datagen.bodies.clothed.fitting import FittedGarment
 from datagen.bodies.clothed.surface import Surface, Worn, borders, cut, subdivided, surface_of
 from datagen.bodies.skinning import Rest
 from datagen.common.errors import BodyError
+from datagen.mesh.geometry import vertex_normals
 from datagen.recipe import GarmentPart
 
 _STATURE = 1.7  # metres; ease is meant for a person of this height, and less for a smaller one
@@ -222,11 +223,3 @@ def _pins(figure: Figure, part: GarmentPart, surface: Surface, vertices: NDArray
         if ("hem" in part.pins and ends[0]) or ("sleeves" in part.pins and part.sleeve is not None and any(ends[1:])):
             found.append(ring)
     return np.concatenate(found) if found else np.empty(0, np.int64)
-
-
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit normals [vertex, 3]: the sum of those of a vertex' faces, weighted by area."""
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(second - first, third - first)
-    summed = np.stack([np.bincount(faces.ravel(), np.repeat(axis, 3), len(vertices)) for axis in across.T], axis=1)
-    return summed / np.sqrt((summed**2).sum(axis=1, keepdims=True))
