@@ -93,16 +93,9 @@ def _are_parts(parts: _Parts, *, joints: int) -> bool:
     )
 
 
-def _is_tree(joints: list[str], parents: list[Any]) -> bool:
-    """Whether every joint leads up to a root, whose parent is -1."""
-    if len(joints) != len(parents) or not all(-1 <= parent < len(joints) for parent in parents):
-        return False
-    rooted = {-1}
-    for _ in joints:
-        rooted |= {joint for joint, parent in enumerate(parents) if parent in rooted}
-        if len(rooted) > len(joints):
-            return True
-    return not joints
+def _is_tree(joints: list[str], parents: list[int]) -> bool:
+    """Whether every joint has its parent before it, or is a root, whose parent is -1."""
+    return len(joints) == len(parents) and all(-1 <= parent < joint for joint, parent in enumerate(parents))
 
 
 def check_same_assets(url: str, group: zarr.Group, present: list[dict[str, str]]) -> None:

@@ -280,6 +280,7 @@ REPAIRED = [
     pytest.param(attributes(joints=5), id="attributes: joints 5"),
     pytest.param(attributes(joint_parents=["x"]), id="attributes: parents"),
     pytest.param(attributes(joint_parents=[99] * 22), id="attributes: parents out of range"),
+    pytest.param(attributes(joint_parents=[*range(1, 24), -1]), id="attributes: parents after their children"),
     pytest.param(attributes(body=[]), id="attributes: body"),
     pytest.param(attributes(provenance="x"), id="attributes: provenance"),
     pytest.param(attributes(statistics={"minimum": "x"}), id="attributes: statistics"),
