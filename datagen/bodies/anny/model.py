@@ -36,6 +36,7 @@ class AnnyModel:
     """See :class:`datagen.bodies.BodyModel`; frame: metres, Y up, facing +Z, +X to the body's left.
 
     Parameters are Anny's phenotypes, followed by its local changes as ``local.NAME`` where the recipe asks for any.
+    ``bones`` are the rig's; ``corrections`` [bone, 3, 3] turn them from its rest to the T-pose, in world axes.
     """
 
     joints = JOINTS
@@ -51,11 +52,11 @@ class AnnyModel:
         )
         self.assets = _assets(recipe)
         self._faces = model.get_triangular_faces().numpy().astype(np.int32)
-        self._bones = Bones.of(recipe.rig, model.bone_labels, model.bone_parents)
+        self.bones = Bones.of(recipe.rig, model.bone_labels, model.bone_parents)
         weights = model.dense_vertex_bone_weights.numpy().astype(np.float64)
-        self._weights = scipy.sparse.csr_array(weights[:, self._bones.order])
-        heads = model.template_bone_heads.numpy()[self._bones.order]
-        self._corrections = t_pose_corrections(self._bones, _y_up(heads))
+        self._weights = scipy.sparse.csr_array(weights[:, self.bones.order])
+        heads = model.template_bone_heads.numpy()[self.bones.order]
+        self.corrections = t_pose_corrections(self.bones, _y_up(heads))
         self._shared_rig = lru_cache(maxsize=4)(self._rig_but_joints)
         self.rest = remembering(self._rest)
 
@@ -79,37 +80,27 @@ class AnnyModel:
 
     def world_rotations(self, poses: Poses) -> NDArray[np.float64]:
         """World rotations [pose, bone, 3, 3] of the rig's bones relative to their rest."""
-        return poses.on(self._bones.joints, self._bones.parents) @ self._corrections
-
-    @property
-    def corrections(self) -> NDArray[np.float64]:
-        """Rotations [bone, 3, 3] from the rig's rest to the T-pose, in world axes."""
-        return self._corrections
-
-    @property
-    def bones(self) -> Bones:
-        """The rig's bones."""
-        return self._bones
+        return poses.on(self.bones.joints, self.bones.parents) @ self.corrections
 
     def rig(self, parameters: NDArray[np.float64], joints: tuple[str, ...]) -> Rig:
         """The bones that carry a pose joint; twist bones, metacarpals and the like are folded into these."""
         shared, kept = self._shared_rig(joints)
-        heads = _y_up(self._shape.heads(tuple(parameters.tolist())))[self._bones.order]
+        heads = _y_up(self._shape.heads(tuple(parameters.tolist())))[self.bones.order]
         return replace(shared, joints=heads[kept].astype(np.float32))
 
     def _rig_but_joints(self, joints: tuple[str, ...]) -> tuple[Rig, list[int]]:
         """What the rigs of all identities share, and the bones whose heads are its joints."""
-        drivers = drivers_of(self._bones.joints, self._bones.parents, joints)
-        rest = Rest(np.empty((0, 3)), np.zeros((len(drivers), 3)), self._weights, self._bones.parents)
-        rig = rig_of(rest, self._bones.labels, drivers, self._corrections)
-        return rig, [self._bones.labels.index(name) for name in rig.names]
+        drivers = drivers_of(self.bones.joints, self.bones.parents, joints)
+        rest = Rest(np.empty((0, 3)), np.zeros((len(drivers), 3)), self._weights, self.bones.parents)
+        rig = rig_of(rest, self.bones.labels, drivers, self.corrections)
+        return rig, [self.bones.labels.index(name) for name in rig.names]
 
     def t_pose(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Vertices [vertex, 3] and bone heads [bone, 3] in SMPL's T-pose, which is no pose of the rig's own."""
         rest = self.rest(parameters)
-        transforms = part_transforms(self._corrections, rest.joints, rest.parents)
+        transforms = part_transforms(self.corrections, rest.joints, rest.parents)
         heads = (transforms[..., :3] @ rest.joints[..., None])[..., 0] + transforms[..., 3]
-        return skin(rest, self._corrections[None])[0].astype(np.float64), heads
+        return skin(rest, self.corrections[None])[0].astype(np.float64), heads
 
     def _rest(self, parameters: NDArray[np.float64]) -> Rest:
         """The identity in Anny's A-pose, bones as joints."""
@@ -117,7 +108,7 @@ class AnnyModel:
         if not np.isfinite(points).all():
             raise BodyError(f"Anny gave a body with non-finite coordinates for the parameters {parameters.tolist()}")
         count = self._weights.shape[0]
-        return Rest(points[:count], points[count:][self._bones.order], self._weights, self._bones.parents)
+        return Rest(points[:count], points[count:][self.bones.order], self._weights, self.bones.parents)
 
 
 def _y_up(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -69,7 +69,7 @@ class TestShape:
         model = body(phenotypes=ALL_AGES, local_changes=0.5)
         parameters = identity(model, 5)
         theirs = annys_own(rig="mixamo", topology="notoes_collapse3pc", local_changes="default")
-        bones, up = model._bones, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        bones, up = model.bones, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
         world = model.world_rotations(POSES)
         parent = np.where(np.array(bones.parents)[None, :, None, None] < 0, np.eye(3), world[:, bones.parents])
         deltas = np.tile(np.eye(4), (len(POSES), len(bones.parents), 1, 1))
@@ -194,7 +194,7 @@ class TestLocalChanges:
         """Bone heads are added up without the vertices there."""
         model = body(local_changes=0.4)
         rig, rest = model.rig(identity(model, 3), JOINTS), model.rest(identity(model, 3))
-        bones = [model._bones.labels.index(name) for name in rig.names]
+        bones = [model.bones.labels.index(name) for name in rig.names]
         assert np.array_equal(rig.joints, rest.joints[bones].astype(np.float32))
 
     def test_zero_values_change_nothing_and_others_do(self) -> None:
