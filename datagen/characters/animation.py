@@ -95,11 +95,7 @@ def world_frames(file: Gltf, clip: Clip, time: float, nodes: Sequence[int]) -> N
     if not np.isfinite(rotations).all():
         raise BodyError(f"{file.path}: clip {clip.name!r} has a key near {time:.2f} s that is no rotation. Repair it")
     frames = Rotation.from_quat(rotations).as_matrix() * file.scales[:, None, :]
-    for node in file.order:
-        parent = file.parents[node]
-        if parent >= 0:
-            frames[node] = frames[parent] @ frames[node]
-    return frames[list(nodes)]
+    return file.in_scene(frames)[list(nodes)]
 
 
 def _clip(file: Gltf, number: int, animation: dict[str, Any], paths: Collection[str]) -> Clip:

@@ -117,7 +117,7 @@ class Gltf:
         return self.in_scene(self.local)
 
     def in_scene(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return matrices [node, 4, 4] of the nodes in the scene, of those relative to their parents."""
+        """Return matrices [node, 4, 4] (or [node, 3, 3]) of the nodes in the scene, of those relative to parents."""
         world = local.copy()
         for number in self.order:
             if self.parents[number] >= 0:
