@@ -3,13 +3,14 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from training.avatar.outfit import Outfit
+from training.avatar.outfit import Outfit, SurfaceSamples
 from training.avatar.wardrobe import Wardrobe
 from training.data.cache_policy import Room
 from training.engine.distributed import Ranks, agreed
@@ -87,44 +88,36 @@ class AvatarTask:
         return AvatarObjective(network, self._network.normals_from * steps, edges, self._network.roughness)
 
     @contextmanager
-    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["ScanFeed"]:
+    def feed(self, ranks: Ranks, device: torch.device) -> Iterator[FrameFeed]:
         """Scans' points, in memory."""
         yield agreed(ranks, lambda: self._feed(ranks, device), what="read the scans")
 
-    def _feed(self, ranks: Ranks, device: torch.device) -> "ScanFeed":
-        return ScanFeed(self._recipe, self._wardrobe.to(device), self._outfits, self.order, ranks, device)
+    def _feed(self, ranks: Ranks, device: torch.device) -> FrameFeed:
+        self._wardrobe.to(device)
+        surfaces = [its.surfaces.load() for its in self._outfits]
+        return FrameFeed(self._recipe, self.order, ranks, partial(self._batch, surfaces, device))
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "AvatarValidation":
         """Measures how far the avatar is from scans."""
         return AvatarValidation(self._wardrobe, self._outfits, device, dtype)
 
-
-class ScanFeed(FrameFeed):
-    """Frames with so many points of each scan."""
-
-    def __init__(
+    def _batch(
         self,
-        recipe: TrainingRecipe,
-        wardrobe: Wardrobe,
-        outfits: Sequence[Outfit],
-        order: FrameOrder,
-        ranks: Ranks,
+        surfaces: Sequence[SurfaceSamples],
         device: torch.device,
-    ) -> None:
-        super().__init__(recipe, order, ranks, device)
-        assert isinstance(recipe.network, AvatarRecipe)
-        self._count, self._wardrobe = recipe.network.scan_points, wardrobe
-        self._surfaces = [its.surfaces.load() for its in outfits]
-
-    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> FrameBatch:
+        rows: list[tuple[int, int]],
+        step: int,
+        first: int,
+    ) -> FrameBatch:
+        """Frames with so many points of each scan."""
         maps, transforms = self._wardrobe.given(rows)
-        scans = tuple(self._scan(*row, step, first + place) for place, row in enumerate(rows))
-        return FrameBatch(maps, transforms, tuple(outfit for outfit, _ in rows), scans)
-
-    def _scan(self, outfit: int, frame: int, step: int, place: int) -> Scan:
-        points, normals = self._surfaces[outfit].points[frame], self._surfaces[outfit].normals[frame]
-        some = drawn(self._seed, step, place, of=len(points), count=min(self._count, len(points)))
-        return Scan(points[some].to(self._device), normals[some].to(self._device))
+        scans = []
+        for place, (outfit, frame) in enumerate(rows, first):
+            points, normals = surfaces[outfit].points[frame], surfaces[outfit].normals[frame]
+            count = min(self._network.scan_points, len(points))
+            some = drawn(self._recipe.seed, step, place, of=len(points), count=count)
+            scans.append(Scan(points[some].to(device), normals[some].to(device)))
+        return FrameBatch(maps, transforms, tuple(outfit for outfit, _ in rows), tuple(scans))
 
 
 class AvatarValidation:

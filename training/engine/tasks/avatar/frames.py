@@ -1,12 +1,10 @@
 """Frames of subjects in the order that a training shows them, and what is drawn for each."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError
@@ -39,13 +37,17 @@ class FrameOrder(BatchOrder):
         return generator(self.seed, Stream.TRAINING_TRIPLES, number).permutation(rows)
 
 
-class FrameFeed(ABC):
+BatchOf = Callable[[list[tuple[int, int]], int, int], Any]
+"""The examples of rows (subject, frame) in a step; the first of them has a place, the last argument, in the batch."""
+
+
+class FrameFeed:
     """This rank's share of every step's frames; see :class:`training.engine.tasks.protocol.Feed`."""
 
     where = "memory"
 
-    def __init__(self, recipe: TrainingRecipe, order: FrameOrder, ranks: Ranks, device: torch.device) -> None:
-        self._seed, self._order, self._device = recipe.seed, order, device
+    def __init__(self, recipe: TrainingRecipe, order: FrameOrder, ranks: Ranks, batch_of: BatchOf) -> None:
+        self._order, self._batch_of = order, batch_of
         self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}
 
     def batches(self, first_step: int) -> Shares:
@@ -53,11 +55,7 @@ class FrameFeed(ABC):
         places = self._order.places(**self._mine)
         for step, share in enumerate(self._order.batches(first_step=first_step, **self._mine), first_step):
             parts = zip(share, places, strict=True)
-            yield share, [self._batch(rows.tolist(), step, first) for rows, first in parts]
-
-    @abstractmethod
-    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> Any:
-        """The examples of rows (subject, frame); the first of them has the place ``first`` in the whole batch."""
+            yield share, [self._batch_of(rows.tolist(), step, first) for rows, first in parts]
 
 
 def drawn(seed: int, step: int, place: int, *, of: int, count: int) -> NDArray[np.int64]:

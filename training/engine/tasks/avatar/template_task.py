@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -86,42 +86,26 @@ class TemplateTask:
         return OccupancyObjective(network)
 
     @contextmanager
-    def feed(self, ranks: Ranks, device: torch.device) -> Iterator["OccupancyFeed"]:
+    def feed(self, ranks: Ranks, device: torch.device) -> Iterator[FrameFeed]:
         """Points around scans, in memory."""
-        yield OccupancyFeed(self._recipe, self._network, self._samples, self.order, ranks, device)
+        yield FrameFeed(self._recipe, self.order, ranks, partial(self._batch, device))
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "OccupancyValidation":
         """Measures intersection over union near the surfaces of scans."""
         return OccupancyValidation(self._samples, device, dtype)
 
-
-class OccupancyFeed(FrameFeed):
-    """Frames with so many points around each scan."""
-
-    def __init__(
-        self,
-        recipe: TrainingRecipe,
-        network: TemplateRecipe,
-        samples: OccupancySamples,
-        order: FrameOrder,
-        ranks: Ranks,
-        device: torch.device,
-    ) -> None:
-        super().__init__(recipe, order, ranks, device)
-        self._network, self._samples = network, samples
-
-    def _batch(self, rows: list[tuple[int, int]], step: int, first: int) -> OccupancyBatch:
-        frames = [frame for _, frame in rows]
-        own, (points, inside) = self._samples, self._samples.hands
+    def _batch(self, device: torch.device, rows: list[tuple[int, int]], step: int, first: int) -> OccupancyBatch:
+        """Frames with so many points around each scan."""
+        own, seed, frames = self._samples, self._recipe.seed, [frame for _, frame in rows]
+        points, inside = own.hands
         taken = [
-            own.frame(frame, drawn(self._seed, step, first + row, of=own.count, count=self._network.points))
-            for row, frame in enumerate(frames)
+            own.frame(frame, drawn(seed, step, place, of=own.count, count=self._network.points))
+            for place, frame in enumerate(frames, first)
         ]
         if len(points):
-            some = drawn(self._seed, step, _HANDS, of=len(points), count=self._network.hand_points)
+            some = drawn(seed, step, _HANDS, of=len(points), count=self._network.hand_points)
             points, inside = points[some], inside[some]
-        samples = stacked(taken)
-        return OccupancyBatch(samples, own.conditions[frames], (points, inside)).to(self._device)
+        return OccupancyBatch(stacked(taken), own.conditions[frames], (points, inside)).to(device)
 
 
 def stacked(frames: Sequence[FrameSamples]) -> FrameSamples:
