@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import scipy.linalg
@@ -28,7 +29,7 @@ from datagen.common.errors import CheckpointError
 from datagen.mesh.geometry import vertex_normals
 from training.avatar.body import CanonicalBody
 from training.avatar.solid import Solid
-from training.checkpoints.weights import read_weights, write_weights_atomically
+from training.checkpoints.tensor_record import TensorRecord
 
 Progress = Callable[[range], Iterable[int]]
 _RIDGE = 1e-7
@@ -60,7 +61,7 @@ class ThinPlate:
 
 
 @dataclass(frozen=True, eq=False)
-class SkinningField:
+class SkinningField(TensorRecord):
     """Skinning weights on a grid of cells that fills a box.
 
     Parameters
@@ -71,6 +72,7 @@ class SkinningField:
         Weights [bone, z, y, x] float16 at the centres of cells.
     """
 
+    kind = "skinning field"
     low: Tensor
     high: Tensor
     grid: Tensor
@@ -96,26 +98,13 @@ class SkinningField:
         grid = self.grid.float()
         return grid / grid.sum(dim=0)
 
-    def save(self, path: Path) -> None:
-        """Write the field as safetensors."""
-        write_weights_atomically(path, {"low": self.low, "high": self.high, "grid": self.grid}, {"kind": _KIND})
-
     @classmethod
-    def load(cls, path: Path) -> "SkinningField":
-        """Read a field.
-
-        Raises
-        ------
-        CheckpointError
-            The file is missing, damaged, or holds something else.
-        """
-        read = read_weights(path)
-        if read.keys() != {"low", "high", "grid"} or read["grid"].ndim != 4:
-            raise CheckpointError(f"{path} holds no skinning field, but {', '.join(sorted(read)[:5]) or 'nothing'}")
-        return cls(**read)
-
-
-_KIND = "skinning field"
+    def load(cls, path: Path) -> Self:
+        """See :meth:`TensorRecord.load`."""
+        field = super().load(path)
+        if field.grid.ndim != 4:
+            raise CheckpointError(f"{path} holds no skinning field, but a grid of {field.grid.ndim} axes")
+        return field
 
 
 def sampled(grid: Tensor, low: Tensor, high: Tensor, points: Tensor) -> Tensor:

@@ -25,7 +25,8 @@ from training.avatar.diffusion import SkinningField
 from training.avatar.occupancy import FrameSamples
 from training.avatar.subject import Subject
 from training.avatar.template import Template
-from training.checkpoints.weights import read_header, read_weights, write_weights_atomically
+from training.checkpoints.tensor_record import TensorRecord
+from training.checkpoints.weights import read_header
 
 Kept = TypeVar("Kept")
 
@@ -102,13 +103,14 @@ class Outfit:
 
 
 @dataclass(frozen=True, eq=False)
-class OccupancySamples:
+class OccupancySamples(TensorRecord):
     """Points around all scans of an outfit: :class:`FrameSamples` with a leading axis of frames.
 
     ``conditions`` [frame, condition]: poses as the network is told of them; ``is_seen`` [frame]; ``hand_points``
     [m, 3], ``hand_inside`` [m]: :func:`training.avatar.occupancy.hand_samples`.
     """
 
+    kind = "occupancy samples"
     roots: Tensor
     valid: Tensor
     inside: Tensor
@@ -142,38 +144,14 @@ class OccupancySamples:
         """Some points of a frame."""
         return FrameSamples(*(its[frame][rows] for its in (self.roots, self.valid, self.inside, self.near)))
 
-    def save(self, path: Path) -> None:
-        """Write them."""
-        write_weights_atomically(path, vars(self), {"kind": "occupancy samples"})
-
-    @classmethod
-    def load(cls, path: Path) -> "OccupancySamples":
-        """Read what :meth:`save` wrote (CheckpointError where it is something else)."""
-        return cls(**_expected(path, tuple(cls.__dataclass_fields__)))
-
 
 @dataclass(frozen=True, eq=False)
-class SurfaceSamples:
+class SurfaceSamples(TensorRecord):
     """Points of the scans' outer surfaces ``points`` [frame, n, 3] with unit ``normals`` [frame, n, 3]."""
 
+    kind = "surface samples"
     points: Tensor
     normals: Tensor
-
-    def save(self, path: Path) -> None:
-        """Write them."""
-        write_weights_atomically(path, vars(self), {"kind": "surface samples"})
-
-    @classmethod
-    def load(cls, path: Path) -> "SurfaceSamples":
-        """Read what :meth:`save` wrote (CheckpointError where it is something else)."""
-        return cls(**_expected(path, ("points", "normals")))
-
-
-def _expected(path: Path, names: tuple[str, ...]) -> dict[str, Tensor]:
-    read = read_weights(path)
-    if read.keys() != set(names):
-        raise CheckpointError(f"{path} holds {', '.join(sorted(read)[:5]) or 'nothing'}, not {', '.join(names)}")
-    return read
 
 
 def outfits_in(folder: Path) -> list[Outfit]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,12 +11,12 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_logits
 
-from datagen.common.errors import CheckpointError, TrainingError
+from datagen.common.errors import TrainingError
 from datagen.mesh.geometry import edges_of, vertex_normals
 from datagen.mesh.surface_nets import surface_nets
 from training.avatar.diffusion import SkinningField, box_cells
 from training.avatar.occupancy import FrameSamples
-from training.checkpoints.weights import read_weights, write_weights_atomically
+from training.checkpoints.tensor_record import TensorRecord
 
 Network = Callable[[Tensor, Tensor], Tensor]
 """Logits [b, n] from points [b, n, 3] and poses [b, condition] (:class:`training.networks.template`)."""
@@ -28,12 +27,13 @@ _AT_ONCE = 2**15  # points whose logits are computed together
 
 
 @dataclass(frozen=True, eq=False)
-class Template:
+class Template(TensorRecord):
     """The canonical surface of an outfit, whose vertices are the points of the avatar.
 
     ``vertices`` [v, 3] float32, metres; ``faces`` [f, 3] int64; unit ``normals`` [v, 3]; ``weights`` [v, bone].
     """
 
+    kind = "template"
     vertices: Tensor
     faces: Tensor
     normals: Tensor
@@ -43,24 +43,6 @@ class Template:
     def euler_characteristic(self) -> int:
         """Vertices - edges + faces: two for each closed piece without a handle."""
         return _euler_characteristic(self.vertices.numpy(), self.faces.numpy())
-
-    def save(self, path: Path) -> None:
-        """Write the template as safetensors."""
-        write_weights_atomically(path, vars(self), {"kind": "template"})
-
-    @classmethod
-    def load(cls, path: Path) -> "Template":
-        """Read a template.
-
-        Raises
-        ------
-        CheckpointError
-            The file is missing, damaged, or holds something else.
-        """
-        read = read_weights(path)
-        if read.keys() != {"vertices", "faces", "normals", "weights"}:
-            raise CheckpointError(f"{path} holds no template, but {', '.join(sorted(read)[:5]) or 'nothing'}")
-        return cls(**read)
 
 
 def pose_condition(rotations: NDArray[np.float64]) -> Tensor:

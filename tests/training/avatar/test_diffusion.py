@@ -81,6 +81,9 @@ def test_a_stored_field_is_the_same(field: SkinningField, tmp_path: Path) -> Non
     write_weights(tmp_path / "other.safetensors", {"layer": torch.ones(2)}, {})
     with pytest.raises(CheckpointError, match="no skinning field, but layer"):
         SkinningField.load(tmp_path / "other.safetensors")
+    replace(field, grid=field.grid[0]).save(tmp_path / "flat.safetensors")
+    with pytest.raises(CheckpointError, match="no skinning field, but a grid of 3 axes"):
+        SkinningField.load(tmp_path / "flat.safetensors")
 
 
 def test_progress_goes_through_all_points(plate: ThinPlate) -> None:

@@ -51,6 +51,15 @@ def test_the_folder_of_an_outfit(tmp_path: Path) -> None:
     assert not outfit.field.is_sound
 
 
+def test_what_was_read_off_samples_is_not_kept_with_them(tmp_path: Path) -> None:
+    """Once the frames to learn from were asked for, they lie beside the fields."""
+    path = drawn_outfit(tmp_path).samples.path
+    samples, content = OccupancySamples.load(path), path.read_bytes()
+    assert samples.seen == [0, 1, 2] and samples.unseen == [3]
+    samples.save(path)
+    assert path.read_bytes() == content
+
+
 def test_what_is_not_there_or_something_else_is_one_line(tmp_path: Path) -> None:
     outfit = drawn_outfit(tmp_path)
     with pytest.raises(CheckpointError, match=r"holds no outfits. Make them: dsffnet avatar train"):

@@ -157,6 +157,7 @@ class AvatarValidation:
 
     def _of(self, row: tuple[int, int], points: Tensor) -> float:
         outfit, frame = row
-        surface, normals = (its[frame].double() for its in vars(self._surfaces[outfit]).values())
+        samples = self._surfaces[outfit]
+        surface, normals = samples.points[frame].double(), samples.normals[frame].double()
         near = nearest(points, surface)
         return 1000 * float(((surface[near] - points) * normals[near]).sum(dim=1).abs().mean())
