@@ -13,51 +13,6 @@ _RESTART_SECONDS, _RESTART_FACTOR = 30.0, 10.0  # a pause as long is a restart, 
 _LEFT_OUT_FIRST = ("meshes", "best", "epoch", "wait", "loss", "pmd")
 
 
-def progress_line(
-    row: Mapping[str, Any],
-    *,
-    steps: int,
-    steps_per_epoch: int | None = None,
-    best: float | None = None,
-    seconds_left: float | None = None,
-    width: int | None = None,
-) -> str:
-    """One line about a training: epoch, step, loss, PMD, meshes a second, input wait if it matters, time left.
-
-    Parameters
-    ----------
-    row
-        The latest of each value in the journal; what is missing is left out.
-    steps, steps_per_epoch
-        Where the training ends, and how long an epoch is; the latter is left out where it is not known.
-    best
-        Least PMD on unseen poses so far, in the normalised box; said where it is better than the latest.
-    seconds_left
-        As :class:`Progress` estimates it.
-    width
-        Characters there is room for; the least important parts are left out until it fits.
-
-    >>> progress_line({"step": 20, "loss/total": 0.5}, steps=100, steps_per_epoch=40, seconds_left=75.0)
-    'epoch 1/3, step 20/100, loss 0.5, 1 min 15 s left'
-    """
-    step = int(row["step"])
-    epoch = min(max(step - 1, 0), max(steps - 1, 0)) // steps_per_epoch + 1 if steps_per_epoch else 0
-    pmd, wait = row.get("evaluation/pmd_unseen"), row.get("input_wait", 0.0)
-    parts = {
-        "epoch": f"epoch {epoch}/{math.ceil(steps / steps_per_epoch)}" if steps_per_epoch else "",
-        "step": f"step {step:,}/{steps:,}",
-        "loss": _said("loss {:.4g}", row.get("loss/total")),
-        "pmd": _said("PMD unseen {:.1f}e-4", None if pmd is None else pmd / PMD_UNIT),
-        "plane": _said("{:.1f} mm to the plane", row.get("evaluation/plane_unseen")),
-        "iou": _said("IoU {:.2f}", row.get("evaluation/iou_unseen")),
-        "best": f"best {best / PMD_UNIT:.1f}e-4" if pmd is not None and best is not None and best < pmd else "",
-        "meshes": _said("{:,.0f} meshes/s", row.get("meshes_per_second")),
-        "wait": f"input wait {wait:.0%}" if wait > 0.02 else "",
-        "left": f"{duration(seconds_left)} left" if seconds_left is not None and step < steps else "",
-    }
-    return _fitted({name: words for name, words in parts.items() if words}, width)
-
-
 def duration(seconds: float) -> str:
     """A time in its two largest units: 45 s, 3 min 20 s, 2 h 5 min, 1 d 4 h."""
     whole = round(seconds)
@@ -69,10 +24,14 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Takes a journal's rows as they come, and says where the training is and how long it will still take."""
+    """Takes a journal's rows as they come, and says where the training is and how long it will still take.
 
-    def __init__(self, *, steps: int, steps_per_epoch: int | None = None, best: float | None = None) -> None:
-        self._steps, self._steps_per_epoch, self._best = steps, steps_per_epoch, best
+    ``steps``, ``steps_per_epoch``: where the training ends, and how long an epoch is, where it is known.
+    """
+
+    def __init__(self, *, steps: int, steps_per_epoch: int | None = None) -> None:
+        self._steps, self._steps_per_epoch = steps, steps_per_epoch
+        self._best: float | None = None
         self._latest: dict[str, Any] = {}
         self._before: Mapping[str, Any] | None = None
         self._intervals: deque[tuple[float, int, bool]] = deque(maxlen=_INTERVALS)
@@ -106,17 +65,36 @@ class Progress:
         return sum(seconds for seconds, _ in usual) / done * (self._steps - self.step) if done else None
 
     def line(self, width: int | None = None) -> str:
-        """See :func:`progress_line`; empty before the first row."""
+        """One line about a training: epoch, step, loss, PMD, meshes a second, input wait if it matters, time left.
+
+        It is made of the latest of each value; what is missing is left out, so that it is empty before the first row.
+        The best PMD is said where it is better than the latest. ``width``: characters there is room for; the least
+        important parts are left out until it fits.
+
+        >>> progress = Progress(steps=100, steps_per_epoch=40)
+        >>> progress.add({"step": 20, "loss/total": 0.5})
+        >>> progress.line()
+        'epoch 1/3, step 20/100, loss 0.5'
+        """
         if self.step is None:
             return ""
-        return progress_line(
-            self._latest,
-            steps=self._steps,
-            steps_per_epoch=self._steps_per_epoch,
-            best=self._best,
-            seconds_left=self.seconds_left(),
-            width=width,
-        )
+        row, steps, steps_per_epoch, best = self._latest, self._steps, self._steps_per_epoch, self._best
+        step, seconds_left = int(self.step), self.seconds_left()
+        epoch = min(max(step - 1, 0), max(steps - 1, 0)) // steps_per_epoch + 1 if steps_per_epoch else 0
+        pmd, wait = row.get("evaluation/pmd_unseen"), row.get("input_wait", 0.0)
+        parts = {
+            "epoch": f"epoch {epoch}/{math.ceil(steps / steps_per_epoch)}" if steps_per_epoch else "",
+            "step": f"step {step:,}/{steps:,}",
+            "loss": _said("loss {:.4g}", row.get("loss/total")),
+            "pmd": _said("PMD unseen {:.1f}e-4", None if pmd is None else pmd / PMD_UNIT),
+            "plane": _said("{:.1f} mm to the plane", row.get("evaluation/plane_unseen")),
+            "iou": _said("IoU {:.2f}", row.get("evaluation/iou_unseen")),
+            "best": f"best {best / PMD_UNIT:.1f}e-4" if pmd is not None and best is not None and best < pmd else "",
+            "meshes": _said("{:,.0f} meshes/s", row.get("meshes_per_second")),
+            "wait": f"input wait {wait:.0%}" if wait > 0.02 else "",
+            "left": f"{duration(seconds_left)} left" if seconds_left is not None and step < steps else "",
+        }
+        return _fitted({name: words for name, words in parts.items() if words}, width)
 
 
 def _said(words: str, value: float | None) -> str:
