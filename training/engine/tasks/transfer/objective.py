@@ -3,16 +3,14 @@
 import torch
 from torch import Tensor, nn
 
-from datagen.store import Dataset
 from training.data.augmentation.shuffle import Shuffle
 from training.data.batch import Batch
-from training.data.rig_table import RigTable
 from training.networks.execution import autocast, compiled
 from training.networks.padded_batches import MixedCounts
 from training.networks.parts import Parts
 from training.objectives.losses import transfer_loss
 from training.objectives.parts import parts_loss
-from training.recipes.training import PartsRecipe, TrainingRecipe
+from training.recipes.training import TrainingRecipe
 
 Losses = dict[str, Tensor]
 
@@ -70,21 +68,3 @@ class PartsObjective(nn.Module):
             surfaces=batch.surfaces,
         )
         return {**parts, "total": loss}
-
-
-def objective_of(network: nn.Module, recipe: TrainingRecipe, device: torch.device) -> nn.Module:
-    """Return the objective that a network is trained by."""
-    return PartsObjective(network) if isinstance(network, Parts) else TransferObjective(network, recipe, device)
-
-
-def rigs_of(recipe: TrainingRecipe, dataset: Dataset, device: torch.device) -> RigTable | None:
-    """Return what a network learns from beside vertices; None where it learns from these alone.
-
-    Raises
-    ------
-    RecipeError
-        The dataset does not tell it (:class:`training.data.rig_table.RigTable`).
-    """
-    if not isinstance(recipe.network, PartsRecipe):
-        return None
-    return RigTable(dataset, dataset.identities("training"), recipe.network.joints, device=device)

@@ -15,11 +15,12 @@ from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import Ranks, agreed
 from training.engine.tasks.protocol import Shares
-from training.engine.tasks.transfer.objective import objective_of, rigs_of
+from training.engine.tasks.transfer.objective import PartsObjective, TransferObjective
 from training.engine.tasks.transfer.step_memory import require_step_memory
 from training.engine.tasks.transfer.validation import TransferValidation, require_measurable
 from training.networks import network_from
-from training.recipes.training import TrainingRecipe
+from training.networks.parts import Parts
+from training.recipes.training import PartsRecipe, TrainingRecipe
 
 
 class TransferTask:
@@ -53,16 +54,17 @@ class TransferTask:
         return network_from(self._recipe.network)
 
     def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
-        """See :func:`objective_of`."""
-        return objective_of(network, self._recipe, device)
+        """See :class:`PartsObjective`, :class:`TransferObjective`."""
+        if isinstance(network, Parts):
+            return PartsObjective(network)
+        return TransferObjective(network, self._recipe, device)
 
     @contextmanager
     def feed(self, ranks: Ranks, device: torch.device) -> Iterator["TripleFeed"]:
         """The training meshes, decoded, and the rigs of the bodies where a network learns from these."""
-        recipe, dataset = self._recipe, self._dataset
         with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
-            rigs = agreed(ranks, lambda: rigs_of(recipe, dataset, device), what="read the rigs")
-            yield TripleFeed(recipe, self.order, bank, rigs, ranks)
+            rigs = agreed(ranks, lambda: self._rigs(device), what="read the rigs")
+            yield TripleFeed(self._recipe, self.order, bank, rigs, ranks)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "TransferValidation":
         """Measures PMD on some of the dataset's evaluation triples."""
@@ -73,6 +75,13 @@ class TransferTask:
         placed: dict[str, Any] = {"device": device, "cache": recipe.cache, "sharers": ranks.here}
         placed["block"] = self.order.memory(rank=ranks.rank, ranks=ranks.count)
         return open_bank(self._dataset, identities, edge_sum=recipe.edge_sum, **placed)
+
+    def _rigs(self, device: torch.device) -> RigTable | None:
+        """What a network learns from beside vertices; None where it learns from these alone."""
+        network, dataset = self._recipe.network, self._dataset
+        if not isinstance(network, PartsRecipe):
+            return None
+        return RigTable(dataset, dataset.identities("training"), network.joints, device=device)
 
 
 class TripleFeed:
