@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from datagen.common.errors import CheckpointError
 from training.checkpoints.checkpoint import Checkpoint, recipe_of, require_checkpoint
 from training.checkpoints.weights import fill_network
 from training.inference.mesh_reading import takes_surfaces
-from training.networks import network_from
+from training.networks import NETWORKS, network_from
 from training.networks.execution import GraphedTransfer
 from training.networks.layers.surface import Surface
 from training.recipes.training import TrainingRecipe
@@ -32,6 +33,11 @@ def load_trained(run: Path) -> tuple[nn.Module, TrainingRecipe, int]:
     """
     checkpoint = require_checkpoint(run, "result", weights_only=True)
     recipe = recipe_of(checkpoint, network_only=True)
+    if recipe.network.name not in NETWORKS:
+        raise CheckpointError(
+            f"{checkpoint.path} holds network {recipe.network.name!r}, which transfers no poses. "
+            f"Name a run of {', '.join(sorted(NETWORKS))}"
+        )
     network = network_from(recipe.network)
     load_weights(network, checkpoint)
     return network.eval(), recipe, checkpoint.step

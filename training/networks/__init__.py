@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
-from typing import Any
 
 from torch import nn
 
@@ -28,32 +26,6 @@ them. One with ``takes_surfaces`` is told ``source_surface`` and ``target_surfac
 """
 
 
-def build_network(name: str, **options: Any) -> nn.Module:
-    """Return a new network.
-
-    Parameters
-    ----------
-    name
-        A key of `NETWORKS`.
-    **options
-        Keyword arguments of its constructor.
-
-    Raises
-    ------
-    ValueError
-        If there is no network of that name.
-
-    Examples
-    --------
-    >>> build_network("dsffnet", encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).training
-    True
-    """
-    if name not in NETWORKS:
-        nearest = difflib.get_close_matches(name, NETWORKS, n=1, cutoff=0.0)[0]
-        raise ValueError(f"unknown network {name!r}; did you mean {nearest!r}? Known: {', '.join(sorted(NETWORKS))}")
-    return NETWORKS[name](**options)
-
-
 def network_from(recipe: NetworkRecipe) -> nn.Module:
     """Return the network that a recipe describes, freshly initialised."""
-    return build_network(recipe.name, **recipe.model_dump(exclude={"name"}))
+    return NETWORKS[recipe.name](**recipe.model_dump(exclude={"name"}))

@@ -24,7 +24,7 @@ from training.evaluation.generalisation import (
 )
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.results import kept_rows, write_csv
-from training.networks import build_network
+from training.networks import NETWORKS
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 
 
@@ -49,7 +49,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[MeshKind]:
 def method() -> LoadedMethod:
     torch.manual_seed(0)
     return LoadedMethod(
-        "DSFFNet", build_network("dsffnet", encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).eval(), 1, ""
+        "DSFFNet", NETWORKS["dsffnet"](encoder_widths=(8, 8, 8), decoder_widths=(8, 8, 8)).eval(), 1, ""
     )
 
 

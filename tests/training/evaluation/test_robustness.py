@@ -29,7 +29,7 @@ from training.evaluation.robustness import (
     measured,
     no_op,
 )
-from training.networks import build_network
+from training.networks import NETWORKS
 from training.objectives.metrics import point_mesh_distance
 from training.reports.plots.robustness import disturbance_picture, robustness_curves
 from training.viz.style import method_colors
@@ -41,7 +41,7 @@ SOME = [BY_NAME["noise"], BY_NAME["subset"], BY_NAME["scale"]]
 def network(name: str = "dsffnet", **options: object) -> torch.nn.Module:
     widths = {"encoder_widths": (8, 8, 8)}
     torch.manual_seed(0)
-    made = build_network(name, **(widths | ({"decoder_widths": (8, 8, 8)} if name == "dsffnet" else {}) | options))
+    made = NETWORKS[name](**(widths | ({"decoder_widths": (8, 8, 8)} if name == "dsffnet" else {}) | options))
     with torch.no_grad():
         for weight in made.parameters():
             weight.add_(0.1 * torch.randn_like(weight))  # alpha and beta begin at 0, where the source plays no part

@@ -15,7 +15,7 @@ from training.inference import transfer
 from training.inference.predict import predict
 from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
-from training.networks import build_network
+from training.networks import NETWORKS
 from training.networks import execution as acceleration
 
 NO_EDGES = torch.zeros(0, 2, dtype=torch.int64)
@@ -24,7 +24,7 @@ NO_EDGES = torch.zeros(0, 2, dtype=torch.int64)
 @pytest.fixture
 def network() -> nn.Module:
     torch.manual_seed(0)
-    return build_network("dsffnet", encoder_widths=(16, 32, 64), decoder_widths=(32, 64, 32)).eval()
+    return NETWORKS["dsffnet"](encoder_widths=(16, 32, 64), decoder_widths=(32, 64, 32)).eval()
 
 
 def meshes_of(batch: int, seed: int = 1) -> dict[str, Tensor]:

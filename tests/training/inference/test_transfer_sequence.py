@@ -15,7 +15,7 @@ from tests.support.three_networks import lively
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.smoothing import smoothed
 from training.inference.transfer import PoseTransfer, placed, scale_of
-from training.networks import build_network
+from training.networks import NETWORKS
 from training.networks.parts import Parts
 
 FACES = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
@@ -31,7 +31,7 @@ class Copier(nn.Module):
 @pytest.fixture
 def transfer() -> PoseTransfer:
     torch.manual_seed(0)
-    return PoseTransfer(build_network("dsffnet", encoder_widths=(8, 16, 32), decoder_widths=(16, 32, 16)))
+    return PoseTransfer(NETWORKS["dsffnet"](encoder_widths=(8, 16, 32), decoder_widths=(16, 32, 16)))
 
 
 def mesh_of(seed: int, count: int = 40) -> Mesh:

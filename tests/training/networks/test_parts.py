@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from datagen.mesh.rig import part_transforms
 from tests.support.shapes.samples import offsets_of
 from tests.support.three_networks import lively, meshes
-from training.networks import build_network, parts
+from training.networks import NETWORKS, parts
 from training.networks.layers import sampling
 from training.networks.layers.rigid_parts import (
     ancestors,
@@ -223,7 +223,7 @@ def test_rotations_about_vectors_and_those_found_from_points_are_scipys() -> Non
 @pytest.mark.parametrize("joints", [{"knee": "hip", "hip": None}, {}])
 def test_joints_that_are_no_tree_are_refused(joints: dict[str, str | None]) -> None:
     with pytest.raises(ValueError, match=r"joints must name a tree|'hip' is not in"):
-        build_network("parts", joints=joints)
+        NETWORKS["parts"](joints=joints)
 
 
 def test_misfit_is_of_each_mesh_alone_and_does_not_see_the_vertices_order() -> None:

@@ -8,7 +8,7 @@ from torch import nn
 
 from datagen.common.errors import StorageError, UnsafeFileError
 from tests.support.disk import small_disk
-from training.networks import build_network
+from training.networks import NETWORKS
 from training.tracking.journal import Journal, coefficient_metrics, journal_from, read_journal
 
 
@@ -122,7 +122,7 @@ def test_a_full_disk_is_one_error_and_no_torn_line_stays(tmp_path: Path) -> None
 
 
 def test_coefficients_under_the_names_of_their_curves() -> None:
-    network = build_network("dsffnet", encoder_widths=(4, 4, 4), decoder_widths=(4, 4, 4))
+    network = NETWORKS["dsffnet"](encoder_widths=(4, 4, 4), decoder_widths=(4, 4, 4))
     with torch.no_grad():
         network.get_parameter("decoder.block1.norm2.alpha").fill_(0.5)
     found = coefficient_metrics(network)

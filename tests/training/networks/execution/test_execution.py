@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from datagen.common.errors import CompilerError
 from tests.support.ranks.one_rank import two_backward_passes
-from training.networks import build_network, execution
+from training.networks import NETWORKS, execution
 from training.networks.execution import GraphedTransfer, compiled, precision
 
 SMALL: dict[str, dict[str, object]] = {
@@ -27,7 +27,7 @@ CPU = torch.device("cpu")
 @pytest.fixture(params=sorted(SMALL))
 def network(request: pytest.FixtureRequest) -> nn.Module:
     torch.manual_seed(0)
-    return build_network(request.param, **SMALL[request.param]).eval()
+    return NETWORKS[request.param](**SMALL[request.param]).eval()
 
 
 def pair() -> dict[str, torch.Tensor]:
@@ -44,7 +44,7 @@ def test_a_graphed_network_gives_what_the_network_gives(network: nn.Module) -> N
 def test_the_surrounding_autocast_has_no_effect() -> None:
     """Not even the weights that it has rounded and keeps, when they change afterwards."""
     torch.manual_seed(0)
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval()
     exact, rounded = (GraphedTransfer(network, precision=name) for name in ("float32", "bfloat16"))
     expected = exact(**pair()), rounded(**pair())
     with torch.autocast("cpu", torch.bfloat16):
@@ -93,7 +93,7 @@ def test_the_constants_taken_before_rounding_change_nothing(monkeypatch: pytest.
     from training.networks.layers import modulation
 
     torch.manual_seed(0)
-    network = build_network("dsffnet", **SMALL["dsffnet"]).double()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).double()
     meshes = {name: mesh.double().requires_grad_() for name, mesh in pair().items()}
 
     def result() -> list[torch.Tensor]:
@@ -182,7 +182,7 @@ def test_a_compiled_network_learns_as_the_original_for_any_vertex_counts() -> No
     """Three counts: the first fixed, the second for any, the third with the kernels of the second."""
     torch._dynamo.reset()
     torch.manual_seed(0)
-    network = build_network("dsffnet", **SMALL["dsffnet"])
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"])
     twin = compiled(network, CPU)
     for source, target in ((90, 70), (100, 80), (95, 75)):
         meshes = {"source": torch.rand(2, source, 3) * 2 - 1, "target": torch.rand(2, target, 3) * 2 - 1}
@@ -203,7 +203,7 @@ def test_a_compiled_network_learns_as_the_original_for_any_vertex_counts() -> No
 def test_a_compiled_network_rounds_where_it_is_told() -> None:
     torch._dynamo.reset()
     torch.manual_seed(0)
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval()
     exact, rounded = network(**pair()), GraphedTransfer(compiled(network, CPU), precision="bfloat16")(**pair())
     assert rounded.dtype == torch.float32
     assert 1e-4 < (rounded - exact).square().mean().sqrt() / exact.std() < 0.05
@@ -237,13 +237,13 @@ def test_single_pairs_are_called_first_then_recorded_and_batches_and_training_ne
 
 @pytest.mark.gpu
 def test_the_latest_shapes_are_kept_and_graphs_go_with_their_network() -> None:
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval().cuda()
     for seed in range(2):  # what cuBLAS keeps for the streams stays
         GraphedTransfer(network)(**on_gpu(seed, 30))
     del network
     gc.collect()
     before = torch.cuda.memory_allocated()
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval().cuda()
     graphed = GraphedTransfer(network, kept=2)
     for vertices in (40, 60, 40, 80, 40, 60):
         for seed in range(2):
@@ -257,7 +257,7 @@ def test_the_latest_shapes_are_kept_and_graphs_go_with_their_network() -> None:
 @pytest.mark.gpu
 @torch.no_grad()
 def test_threads_wait_for_each_other() -> None:
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval().cuda()
     graphed, inputs = GraphedTransfer(network), [on_gpu(seed) for seed in range(12)]
     expected = [network(**meshes) for meshes in inputs]
     with ThreadPoolExecutor(6) as pool:
@@ -326,7 +326,7 @@ def test_a_graph_recorded_or_replayed_under_autocast_computes_in_its_own_precisi
 def test_a_compiled_network_is_replayed_on_a_gpu() -> None:
     torch._dynamo.reset()
     torch.manual_seed(0)
-    network = build_network("dsffnet", **SMALL["dsffnet"]).eval().cuda()
+    network = NETWORKS["dsffnet"](**SMALL["dsffnet"]).eval().cuda()
     twin = compiled(network, torch.device("cuda"))
     graphed = GraphedTransfer(twin)
     for seed in range(4):
@@ -337,7 +337,7 @@ def test_a_compiled_network_is_replayed_on_a_gpu() -> None:
 def test_inference_in_bfloat16_is_that_of_training_up_to_rounding() -> None:
     """Without gradients features pass rounded from product to product, and memory is used again."""
     torch.manual_seed(0)
-    network = build_network("dsffnet", encoder_widths=(16, 32, 64), decoder_widths=(32, 128, 32))
+    network = NETWORKS["dsffnet"](encoder_widths=(16, 32, 64), decoder_widths=(32, 128, 32))
     meshes = {name: torch.rand(2, 12 * mesh.shape[1], 3) * 2 - 1 for name, mesh in pair().items()}
     with torch.autocast("cpu", torch.bfloat16):
         trained = network(**meshes)

@@ -21,14 +21,14 @@ from pathlib import Path
 
 import torch
 
-from training.networks import build_network
+from training.networks import NETWORKS
 
 def peak():  # of this process alone: getrusage also counts the one that started it
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
 
 torch.set_num_threads(1)
-before, network = peak(), build_network(sys.argv[1], **json.loads(sys.argv[2])).eval()
+before, network = peak(), NETWORKS[sys.argv[1]](**json.loads(sys.argv[2])).eval()
 with torch.no_grad():
     output = network(source=torch.rand(1, 28920, 3) * 2 - 1, target=torch.rand(1, 28920, 3) * 2 - 1)
 assert output.shape == (1, 28920, 3) and torch.isfinite(output).all()

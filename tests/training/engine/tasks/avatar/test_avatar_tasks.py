@@ -17,6 +17,7 @@ from training.engine.tasks.avatar.frames import FrameOrder, drawn
 from training.engine.tasks.registry import task_of
 from training.engine.train_step import Learner
 from training.engine.trainer import train
+from training.inference.predict import load_trained
 from training.recipes.training import TrainingRecipe
 from training.tracking.journal import read_journal
 from workflows.avatar.runs import trained
@@ -109,3 +110,9 @@ def test_an_avatar_is_resumed_on_no_other_templates(outfit: Outfit, tmp_path: Pa
     with pytest.raises(CheckpointError, match="was trained on dataset"):
         trained(recipe, place, RunFolder(tmp_path / "run"), section="avatar")
     assert not trained(recipe, outfit.path.parent, RunFolder(tmp_path / "run"), section="avatar").training
+
+
+def test_an_avatar_transfers_no_poses(outfit: Outfit, tmp_path: Path) -> None:
+    train(recipe_of(AVATAR, steps=1), data=str(outfit.path.parent), run=tmp_path)
+    with pytest.raises(CheckpointError, match="network 'avatar', which transfers no poses"):
+        load_trained(tmp_path)
