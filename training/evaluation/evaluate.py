@@ -33,7 +33,8 @@ from training.evaluation.measure import (
     measure_chunk,
 )
 from training.evaluation.results import Row, forget_pieces, piece_name, read_piece, read_rows, write_rows
-from training.recipes.training import EvaluationRecipe, NetworkRecipe
+from training.recipes.networks import NetworkRecipe
+from training.recipes.training import EvaluationRecipe
 
 __all__ = [
     "NO_OPS",

@@ -10,7 +10,7 @@ from training.networks.corenet3d import CoreNet3D
 from training.networks.dsffnet import DSFFNet
 from training.networks.npt import NPT
 from training.networks.parts import Parts
-from training.recipes.training import NetworkRecipe
+from training.recipes.networks import NetworkRecipe
 
 NETWORKS: dict[str, Callable[..., nn.Module]] = {
     "corenet3d": CoreNet3D,

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 
 from datagen.common.errors import RecipeError
 from datagen.recipe.text import changed, faults_text, parse_words, read_values
-from training.recipes.training import DEFAULT_NETWORK, TrainingRecipe
+from training.recipes.networks import DEFAULT_NETWORK
+from training.recipes.training import TrainingRecipe
 
 
 def recipe_in(path: Path, words: Sequence[str] = ()) -> TrainingRecipe:

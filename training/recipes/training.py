@@ -8,33 +8,13 @@ from pydantic import AfterValidator, Field, model_validator
 from datagen.common.errors import RecipeError
 from datagen.recipe import Frozen
 from training.recipes.networks import (
-    DEFAULT_NETWORK,
-    NETWORK_NAMES,
     AvatarRecipe,
-    CoreNet3dRecipe,
     DsffnetRecipe,
     NetworkRecipe,
     NptRecipe,
     PartsRecipe,
     TemplateRecipe,
 )
-
-__all__ = [
-    "DEFAULT_NETWORK",
-    "NETWORK_NAMES",
-    "PATH_KEYS",
-    "AugmentationRecipe",
-    "CoreNet3dRecipe",
-    "DsffnetRecipe",
-    "EvaluationRecipe",
-    "NetworkRecipe",
-    "NptRecipe",
-    "PartsRecipe",
-    "ScheduleRecipe",
-    "TrainingRecipe",
-    "block_bytes",
-    "budget_seconds",
-]
 
 ONE_CYCLE_WARM_UP = 0.1
 """Fraction of the steps that a one-cycle schedule rises in, where the recipe says none."""

@@ -19,7 +19,8 @@ from training.evaluation.measure import CONTROLS
 from training.evaluation.run_curves import run_curve
 from training.evaluation.tables import COLUMNS, mean_of, methods_of, summary
 from training.networks import network_from
-from training.recipes.training import NptRecipe, PartsRecipe, TrainingRecipe
+from training.recipes.networks import NptRecipe, PartsRecipe
+from training.recipes.training import TrainingRecipe
 from training.reports.blocks import Block, Code, Facts, Picture, Section, shown
 from training.reports.card_texts import (
     DATASET_LIMITS,

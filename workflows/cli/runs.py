@@ -133,7 +133,7 @@ def recipe_command(options: argparse.Namespace) -> None:
 
 
 def _import_weights_options(made: Parser) -> None:
-    from training.recipes.training import NETWORK_NAMES
+    from training.recipes.networks import NETWORK_NAMES
 
     published = [name for name in NETWORK_NAMES if name != "parts"]
     made.add_argument("network", choices=published, help="whose they are")

@@ -20,7 +20,8 @@ from training.engine.resume import require_same_training
 from training.evaluation.document import plain
 from training.inference.domain_check import noted, seen_in
 from training.objectives import PMD_UNIT
-from training.recipes.training import NetworkRecipe, TrainingRecipe
+from training.recipes.networks import NetworkRecipe
+from training.recipes.training import TrainingRecipe
 from training.reports.plots.training_curve import draw_coefficients, draw_training_curve
 from training.tracking.journal import read_journal
 from training.tracking.provenance import write_run_head

@@ -13,9 +13,9 @@ from datagen.common.errors import RecipeError
 from datagen.recipe import ANIMALS, PART_KINDS, DatasetRecipe, Frozen
 from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
 from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
-from training.recipes.networks import AvatarRecipe, TemplateRecipe
-from training.recipes.training import DEFAULT_NETWORK, EvaluationRecipe, TrainingRecipe
+from training.recipes.networks import DEFAULT_NETWORK, AvatarRecipe, TemplateRecipe
 from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
+from training.recipes.training import EvaluationRecipe, TrainingRecipe
 from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
 
 

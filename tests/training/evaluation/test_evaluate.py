@@ -24,7 +24,8 @@ from training.evaluation.tables import methods_of
 from training.inference.predict import load_trained, predict
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import edge_length_ratio_error, point_mesh_distance
-from training.recipes.training import CoreNet3dRecipe, DsffnetRecipe, EvaluationRecipe, NetworkRecipe, NptRecipe
+from training.recipes.networks import CoreNet3dRecipe, DsffnetRecipe, NetworkRecipe, NptRecipe
+from training.recipes.training import EvaluationRecipe
 from training.reports.examples import comparisons_of
 
 RECIPE = EvaluationRecipe(emd_points=16, chunk=3)

@@ -8,7 +8,8 @@ import torch
 from tests.support.three_networks import lively, meshes
 from training.networks import network_from
 from training.networks.npt import NPT
-from training.recipes.training import DsffnetRecipe, NptRecipe, TrainingRecipe
+from training.recipes.networks import DsffnetRecipe, NptRecipe
+from training.recipes.training import TrainingRecipe
 
 NARROW = (8, 12, 20)
 DOUBLE = torch.float64

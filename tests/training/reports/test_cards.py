@@ -17,7 +17,8 @@ from tests.support.workflows import finished_workflow
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.evaluation.evaluate import NO_OPS, Row
 from training.inference.predict import load_trained
-from training.recipes.training import NETWORK_NAMES, TrainingRecipe
+from training.recipes.networks import NETWORK_NAMES
+from training.recipes.training import TrainingRecipe
 from training.reports.card_texts import FAMILIES, NETWORKS, POSES, family_texts
 from training.reports.cards import dataset_card, model_card
 from training.reports.report import Block, Code, Facts, Picture, Section, Table, Text

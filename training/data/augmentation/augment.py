@@ -20,7 +20,8 @@ from training.networks.execution import sent
 from training.networks.layers.rigid_parts import about_vertical, turned_about
 from training.networks.parts import boxed
 from training.objectives.losses import PackedEdges
-from training.recipes.training import AugmentationRecipe, PartsRecipe, TrainingRecipe
+from training.recipes.networks import PartsRecipe
+from training.recipes.training import AugmentationRecipe, TrainingRecipe
 
 
 class Augmentation:

@@ -13,7 +13,8 @@ from datagen.common.resources import bytes_text
 from datagen.store import Dataset
 from training.data.cache_policy import Room
 from training.networks import network_from
-from training.recipes.training import NetworkRecipe, TrainingRecipe
+from training.recipes.networks import NetworkRecipe
+from training.recipes.training import TrainingRecipe
 
 _PARAMETER = 16
 """Bytes of a parameter: itself, its gradient, the optimiser's two means."""

@@ -20,7 +20,8 @@ from training.engine.tasks.transfer.step_memory import require_step_memory
 from training.engine.tasks.transfer.validation import TransferValidation, require_measurable
 from training.networks import network_from
 from training.networks.parts import Parts
-from training.recipes.training import PartsRecipe, TrainingRecipe
+from training.recipes.networks import PartsRecipe
+from training.recipes.training import TrainingRecipe
 
 
 class TransferTask:

@@ -17,7 +17,8 @@ from training.data.triples import Triples
 from training.engine.tasks.transfer.snapshots import draw_snapshot
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
-from training.recipes.training import PartsRecipe, TrainingRecipe
+from training.recipes.networks import PartsRecipe
+from training.recipes.training import TrainingRecipe
 from training.tracking.journal import coefficient_metrics
 
 log = logging.getLogger(__name__)
