@@ -10,7 +10,7 @@ without a checkpoint, so that this average is neither kept nor evaluated.)
 
 import contextlib
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -98,9 +98,16 @@ class Learner:
         """The first step that was not finite on this rank, counted from 1; 0 if there is none. Waits for the device."""
         return int(self._bad_step)
 
-    def evaluated(self) -> contextlib.AbstractContextManager[Any]:
-        """While the block runs, the network has the weights that are to be evaluated: the average, if there is one."""
-        return self.average.swapped_in(self.network) if self.average else contextlib.nullcontext()
+    @contextlib.contextmanager
+    def evaluated(self) -> Iterator[None]:
+        """While the block runs, the network is in evaluation mode, without gradients; with averaged weights, if any."""
+        averaged = self.average.swapped_in(self.network) if self.average else contextlib.nullcontext()
+        with averaged, torch.no_grad():
+            self.network.eval()
+            try:
+                yield
+            finally:
+                self.network.train()
 
     def state(self) -> dict[str, Any]:
         """All that a step depends on but the weights and their average, which have files of their own."""

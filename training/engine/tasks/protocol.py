@@ -4,6 +4,7 @@ The rest is the same for whatever is learned: ranks, steps, checkpoints, the jou
 a class with these members, and a line in :mod:`training.engine.tasks.registry`.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -41,16 +42,21 @@ class Feed(Protocol):
         """This rank's share of every step from ``first_step`` on, without end, on its device."""
 
 
-class Validation(Protocol):
-    """What is measured of a network while it learns, always on the same examples."""
+class Validation(ABC):
+    """What is measured of a network while it learns, always on the same examples; the base of those that do."""
 
+    decides: str
+    """What tells which weights are best, measured as ``decides_seen`` and ``decides_unseen``: ``evaluation/pmd``."""
+
+    @abstractmethod
     def measure(self, network: nn.Module) -> dict[str, float]:
-        """``evaluation/NAME`` of each measure."""
+        """``evaluation/NAME`` of each measure, of a network in evaluation mode."""
 
     def decisive(self, metrics: dict[str, float]) -> float:
-        """The measure that decides which weights are best: the least."""
+        """The measure that decides which weights are best: the least. It is of unseen poses, where there are."""
+        return metrics.get(f"{self.decides}_unseen", metrics.get(f"{self.decides}_seen", float("inf")))
 
-    def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
+    def draw(self, network: nn.Module, path: Path, *, title: str) -> None:  # noqa: B027  # most draw nothing
         """A picture of some examples; none where they cannot be drawn."""
 
 

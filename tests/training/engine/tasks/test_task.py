@@ -55,6 +55,7 @@ class Same(nn.Module):
         self.network = network
 
     def forward(self, batch: Cloud, *, step: int) -> dict[str, Tensor]:
+        assert self.network.training and torch.is_grad_enabled()
         loss = (self.network(source=batch.points, target=batch.points) - batch.points).square().mean()
         return {"total": loss, "same": loss}
 
@@ -91,12 +92,14 @@ class CloudTask:
         return self
 
     def measure(self, network: nn.Module) -> dict[str, float]:
+        assert not network.training and not torch.is_grad_enabled()
         return {"evaluation/size": float(sum(its.detach().square().sum() for its in network.parameters()))}
 
     def decisive(self, metrics: dict[str, float]) -> float:
         return metrics["evaluation/size"]
 
     def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
+        assert not network.training and not torch.is_grad_enabled()
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(title)
 

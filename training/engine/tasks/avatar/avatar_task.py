@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from training.avatar.wardrobe import Wardrobe
 from training.data.cache_policy import Room
 from training.engine.distributed import Ranks, agreed
 from training.engine.tasks.avatar.frames import FrameFeed, FrameOrder, drawn
+from training.engine.tasks.protocol import Validation
 from training.objectives.point_losses import Edges, Scan, avatar_loss, nearest
 from training.recipes.networks import AvatarRecipe
 from training.recipes.training import TrainingRecipe
@@ -120,9 +120,10 @@ class AvatarTask:
         return FrameBatch(maps, transforms, tuple(outfit for outfit, _ in rows), tuple(scans))
 
 
-class AvatarValidation:
+class AvatarValidation(Validation):
     """``evaluation/plane_seen``, ``plane_unseen``: mm of surfaces from the scans' planes; the latter decides."""
 
+    decides = "evaluation/plane"
     _FRAMES = 4
 
     def __init__(self, wardrobe: Wardrobe, outfits: Sequence[Outfit], device: torch.device, dtype: torch.dtype) -> None:
@@ -131,19 +132,8 @@ class AvatarValidation:
 
     def measure(self, network: nn.Module) -> dict[str, float]:
         """See the class."""
-        network.eval()
-        try:
-            found = {kind: self._plane(network, kind) for kind in ("seen", "unseen")}
-        finally:
-            network.train()
-        return {f"evaluation/plane_{kind}": value for kind, value in found.items() if value is not None}
-
-    def decisive(self, metrics: dict[str, float]) -> float:
-        """Of unseen poses, where there are."""
-        return metrics.get("evaluation/plane_unseen", metrics.get("evaluation/plane_seen", float("inf")))
-
-    def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
-        """Nothing: the evaluation draws."""
+        found = {kind: self._plane(network, kind) for kind in ("seen", "unseen")}
+        return {f"{self.decides}_{kind}": value for kind, value in found.items() if value is not None}
 
     def _plane(self, network: nn.Module, kind: str) -> float | None:
         rows = [

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +14,7 @@ from training.avatar.template import near_surface_iou, template_loss
 from training.data.cache_policy import Room
 from training.engine.distributed import Ranks
 from training.engine.tasks.avatar.frames import FrameFeed, FrameOrder, drawn
+from training.engine.tasks.protocol import Validation
 from training.networks.template import OccupancyTemplate
 from training.recipes.networks import TemplateRecipe
 from training.recipes.training import TrainingRecipe
@@ -116,9 +116,10 @@ def stacked(frames: Sequence[FrameSamples]) -> FrameSamples:
 _HANDS = 2**19  # a place that no frame has
 
 
-class OccupancyValidation:
+class OccupancyValidation(Validation):
     """``evaluation/iou_seen`` and ``evaluation/iou_unseen``, over some frames; the latter decides."""
 
+    decides = "evaluation/iou"
     _FRAMES = 4
 
     def __init__(self, samples: OccupancySamples, device: torch.device, dtype: torch.dtype) -> None:
@@ -137,21 +138,14 @@ class OccupancyValidation:
 
     def measure(self, network: nn.Module) -> dict[str, float]:
         """See the class."""
-        network.eval()
-        try:
-            return {
-                f"evaluation/iou_{kind}": near_surface_iou(network, batch.samples, batch.condition)
-                for kind, batch in self._batches.items()
-            }
-        finally:
-            network.train()
+        return {
+            f"{self.decides}_{kind}": near_surface_iou(network, batch.samples, batch.condition)
+            for kind, batch in self._batches.items()
+        }
 
     def decisive(self, metrics: dict[str, float]) -> float:
         """What is missing to a whole intersection."""
-        return 1 - metrics.get("evaluation/iou_unseen", metrics.get("evaluation/iou_seen", 0.0))
-
-    def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
-        """Nothing: the surface is extracted at the end."""
+        return 1 - super().decisive(metrics)
 
 
 def template_network(recipe: TemplateRecipe, outfit: Outfit) -> OccupancyTemplate:

@@ -42,7 +42,7 @@ def draw_snapshot(
     Parameters
     ----------
     network
-        Called as ``network(source=, target=)``; its mode is as before afterwards.
+        Called as ``network(source=, target=)``, in the mode that it is in.
     batch
         Normalised vertices [batch, vertex, 3], Y up, on any device.
     faces : array [f, 3]
@@ -93,11 +93,7 @@ class _Row:
 
 
 def _rows(network: nn.Module, batch: Batch, faces: Integers) -> list[_Row]:
-    was_training = network.training
-    try:
-        output = predict(network.eval(), batch)
-    finally:
-        network.train(was_training)
+    output = predict(network, batch)
     pmd = point_mesh_distance(output, batch.truth).tolist()
     parts = {"source": batch.source, "target": batch.target, "output": output, "truth": batch.truth}
     arrays = {role: part.detach().cpu().double().numpy() for role, part in parts.items()}

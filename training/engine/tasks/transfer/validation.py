@@ -1,8 +1,6 @@
 """What is measured of pose transfer while it learns: PMD on fixed triples of the evaluation list."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from datagen.common.errors import DatasetError
 from datagen.store import Dataset
 from training.data.batch import Batch, read_batch
 from training.data.triples import Triples
+from training.engine.tasks.protocol import Validation
 from training.engine.tasks.transfer.snapshots import draw_snapshot
 from training.inference.predict import predict
 from training.objectives.metrics import point_mesh_distance
@@ -24,13 +23,15 @@ from training.tracking.journal import coefficient_metrics
 log = logging.getLogger(__name__)
 
 
-class TransferValidation:
+class TransferValidation(Validation):
     """Metrics and pictures of fixed triples of a dataset's evaluation lists, so that curves of a run are comparable.
 
     PMD is :func:`training.objectives.metrics.point_mesh_distance`, the mean over ``recipe.evaluate_triples`` of each
     pose type;
     ``evaluation/pmd_unseen`` decides which checkpoint is best (``pmd_seen`` where no unseen poses are listed).
     """
+
+    decides = "evaluation/pmd"
 
     def __init__(self, dataset: Dataset, recipe: TrainingRecipe, device: torch.device, dtype: torch.dtype) -> None:
         self._batches: dict[str, Batch] = {}
@@ -46,16 +47,11 @@ class TransferValidation:
 
     def measure(self, network: nn.Module) -> dict[str, float]:
         """``evaluation/pmd_seen``, ``evaluation/pmd_unseen`` and, where there are, the adaptive coefficients."""
-        found = {}
-        with _evaluating(network):
-            for pose_type, batch in self._batches.items():
-                prediction = predict(network, batch)
-                found[f"evaluation/pmd_{pose_type}"] = float(_pmd(prediction, batch).mean())
+        found = {
+            f"{self.decides}_{pose_type}": float(_pmd(predict(network, batch), batch).mean())
+            for pose_type, batch in self._batches.items()
+        }
         return found | coefficient_metrics(network)
-
-    def decisive(self, metrics: dict[str, float]) -> float:
-        """The PMD that decides which weights are best."""
-        return metrics.get("evaluation/pmd_unseen", metrics.get("evaluation/pmd_seen", float("inf")))
 
     def draw(self, network: nn.Module, path: Path, *, title: str) -> None:
         """A picture of a few fixed transfers, of unseen poses where there are; bodies of one topology only."""
@@ -90,14 +86,3 @@ def _pmd(prediction: Tensor, batch: Batch) -> Tensor:
         return point_mesh_distance(prediction, batch.truth)
     meshes = zip(prediction, batch.truth, batch.target_counts, strict=True)
     return torch.cat([point_mesh_distance(found[None, :n], truth[None, :n]) for found, truth, n in meshes])
-
-
-@contextmanager
-def _evaluating(network: nn.Module) -> Iterator[None]:
-    """The network in evaluation mode, without gradients."""
-    network.eval()
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        network.train()
