@@ -12,13 +12,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
 
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 
 Disturb = Callable[[Mesh, float, int], Mesh]
 NO_FACES: NDArray[np.int64] = np.empty((0, 3), np.int64)
 _FEWEST = 3  # vertices that are always left
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,8 @@ def turn(axis: str) -> Disturb:
 
     def turned(mesh: Mesh, amount: float, seed: int) -> Mesh:
         centre = bounding_box(mesh.vertices).centre
-        return Mesh((mesh.vertices - centre) @ _rotation(_AXES[axis], amount).T + centre, mesh.faces)
+        rotation = Rotation.from_euler(axis, amount, degrees=True).as_matrix()
+        return Mesh((mesh.vertices - centre) @ rotation.T + centre, mesh.faces)
 
     return turned
 
@@ -240,13 +241,3 @@ def _split(mesh: Mesh) -> Mesh:
     quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     vertices = np.concatenate([mesh.vertices, mesh.vertices[edges].mean(axis=1)])
     return Mesh(vertices, np.concatenate([np.stack(each, axis=1) for each in quarters]))
-
-
-def _rotation(axis: int, degrees: float) -> NDArray[np.float64]:
-    """The right-handed rotation [3, 3] about a coordinate axis."""
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[first, first] = matrix[second, second] = cosine
-    matrix[first, second], matrix[second, first] = -sine, sine
-    return matrix
