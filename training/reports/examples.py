@@ -46,10 +46,9 @@ def comparisons_of(
 def draw_comparisons(comparisons: Sequence[Comparison], folder: Path, *, title: str) -> None:
     """Write figures/examples.png, viewer.html, and meshes/NN-ROLE.glb of each; an output is NN-output-METHOD.glb.
 
-    Of a single method it is NN-output.glb; several are also shown near by.
+    Of a single method it is NN-output.glb.
     """
-    several = any(len(comparison.outputs) > 1 for comparison in comparisons)
-    comparison_figure(comparisons, folder / "figures" / "examples.png", close_ups=several)
+    comparison_figure(comparisons, folder / "figures" / "examples.png")
     write_viewer(comparisons, folder / "viewer.html", title=title)
     for number, comparison in enumerate(comparisons):
         for name, mesh in comparison.meshes().items():

@@ -26,13 +26,13 @@ def comparison_figure(
     path: str | os.PathLike[str],
     *,
     panel: tuple[int, int] | None = None,
-    close_ups: bool = False,
 ) -> Path:
     """Draw source, target, each method's output and the ground truth of each transfer as one row, with the errors.
 
     The panels of a row share one camera; the source is drawn at the truth's size. Errors have one scale of colours in
     the whole figure: below each output or, of a single method, in a last column. Of several methods, bars compare the
-    mean errors of a row, and the words under the one with the least PMD are bold. Without a truth there are no errors.
+    mean errors of a row, the words under the one with the least PMD are bold, and outputs and truth are shown near by
+    too, where the methods differ most. Without a truth there are no errors.
 
     Parameters
     ----------
@@ -41,8 +41,6 @@ def comparison_figure(
     path : path of the PNG to write
     panel : (int, int), optional
         Width and height of a panel in pixels; by default 312 wide and as high as the meshes need.
-    close_ups : bool
-        Whether several methods and the truth are shown near by too, where the methods differ most.
 
     Raises
     ------
@@ -52,7 +50,7 @@ def comparison_figure(
     if not rows:
         raise ValueError("comparison_figure needs at least one example")
     solid = [ShownRow(row, placed(row), errors_of(row)) for row in rows]
-    columns = Columns(methods_in(rows), panel or panel_size(solid), any(row.errors for row in solid), close_ups)
+    columns = Columns(methods_in(rows), panel or panel_size(solid), any(row.errors for row in solid))
     about = _Errors(error_limit(rows), max(row.largest_mean for row in solid))
     drawn = [row.strips(columns, about.limit) for row in solid]
     under = _UNDER if len(columns.methods) > 1 else 0

@@ -29,7 +29,6 @@ class Columns:
     methods: Sequence[str]
     panel: tuple[int, int]
     errors: bool
-    close_ups: bool = False
 
     @property
     def stacked(self) -> bool:
@@ -87,7 +86,7 @@ class ShownRow:
         heats = {
             place: self.heat(method, camera, columns.panel, limit) for place, method in enumerate(columns.methods, 2)
         }
-        if columns.stacked and columns.close_ups and len(self.errors) > 1:
+        if columns.stacked and len(self.errors) > 1:
             near = CloseUp.of(self.meshes["truth"], [self.meshes[output_of(method)] for method in self.errors])
             marked = {place: _marked(name, meshes[place], near, camera) for place, name in enumerate(columns.names)}
             return [Strip.of(marked), Strip.of(heats), self._close_ups(columns, near.camera(camera))]

@@ -128,7 +128,7 @@ def test_methods_have_their_numbers_the_best_in_bold_and_without_a_truth_there_a
 ) -> None:
     figures, row = caught(monkeypatch, module), comparison(NPT=0.4, DSFFNet=0.02, CoreNet=0.1)
     for shown in ([row], [replace(row, truth=None)], [row, comparison(NPT=0.3)]):  # the last lacks some methods
-        comparison_figure(shown, "unused.png", panel=PANEL, close_ups=True)
+        comparison_figure(shown, "unused.png", panel=PANEL)
     weights, without, _ = map(words, figures)
     assert weights["off by 0.02"] == "bold" and weights["off by 0.4"] == weights["off by 0.1"] == "normal"
     assert {"NPT", "DSFFNet", "CoreNet", "Source", "Target", "Ground truth"} <= set(weights)
