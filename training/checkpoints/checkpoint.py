@@ -42,7 +42,7 @@ from training.checkpoints.folder import (
     write_manifest,
 )
 from training.checkpoints.state_file import read_state
-from training.checkpoints.weights import cast_weights, read_header, read_weights
+from training.checkpoints.weights import About, cast_weights, read_header, read_weights
 from training.recipes.training import TrainingRecipe
 
 log = logging.getLogger(__name__)
@@ -61,9 +61,9 @@ class Checkpoint:
     """
 
     path: Path
-    step: int
-    recipe: dict[str, Any]
-    dataset: str
+    step: int = 0
+    recipe: dict[str, Any] = field(default_factory=dict)
+    dataset: str = ""
     dataset_sha256: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     best: bool = False
@@ -254,18 +254,8 @@ def _named(path: Path, *, weights_only: bool) -> Checkpoint:
 
 
 def _checkpoint(path: Path, about: Mapping[str, Any]) -> Checkpoint:
-    return Checkpoint(
-        path=path,
-        step=about.get("step", 0),
-        recipe=about.get("recipe", {}),
-        dataset=about.get("dataset", ""),
-        dataset_sha256=about.get("dataset_sha256", ""),
-        versions=about.get("versions", {}),
-        best=about.get("best", False),
-        finished=about.get("finished", False),
-        last_step=about.get("last_step"),
-        has_average=AVERAGE in about.get("sha256", {}),
-    )
+    said = {name: about[name] for name in About.model_fields if name in about}
+    return Checkpoint(path, has_average=AVERAGE in about.get("sha256", {}), **said)
 
 
 def recipe_of(checkpoint: Checkpoint, *, network_only: bool = False) -> TrainingRecipe:
