@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,8 @@ from datagen.store.objects import read_bytes, write_bytes
 from datagen.store.schema import open_group
 from datagen.store.verify import find_faults
 from tests.support.commands import wait_for
+from tests.support.damage.object_store import BUCKET, s3_server
 from tests.support.files import tree_hash
-from tests.support.ranks import free_port
 from tests.support.recipes import tiny_dataset, tiny_training
 from training.recipes.training import EvaluationRecipe
 from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
@@ -123,40 +122,11 @@ def test_loss_of_a_node(undisturbed: Path, tmp_path: Path) -> None:
     assert tree_hash(url) == tree_hash(undisturbed)
 
 
-@contextmanager
-def s3_server() -> Iterator[str]:
-    """An S3 API server as a process of its own; its address."""
-    port = free_port()
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.kill()
-        server.wait()
-
-
 @pytest.fixture(scope="module")
 def bucket() -> Iterator[str]:
     """URL of an empty bucket; credentials and address are in the environment, as they would be for a person."""
-    import boto3
-
-    variables = {"AWS_ACCESS_KEY_ID": "k", "AWS_SECRET_ACCESS_KEY": "s", "AWS_DEFAULT_REGION": "us-east-1"}
-    with s3_server() as address, pytest.MonkeyPatch.context() as patch:
-        for name, value in {**variables, "AWS_ENDPOINT_URL": address}.items():
-            patch.setenv(name, value)
-        client = boto3.client("s3")
-        wait_for(lambda: _answers(client))
-        client.create_bucket(Bucket="datasets")
-        yield "s3://datasets"
-
-
-def _answers(client: object) -> bool:
-    try:
-        client.list_buckets()  # type: ignore[attr-defined]
-    except Exception:
-        return False
-    return True
+    with s3_server():
+        yield BUCKET
 
 
 def objects(url: str) -> dict[str, bytes]:
