@@ -5,11 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from datagen.mesh.files import load_mesh, save_mesh
+from datagen.mesh.files import save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
 from tests.support.commands import ROOT, command, fails, process
@@ -105,44 +104,6 @@ def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
     assert "grid/training/0/vertices/c/2/1/0/0: its hash" in command("verify", data).stdout
     assert "is whole again" in command("verify", data, "--repair").stdout
     assert command("verify", data).returncode == 0
-
-
-def test_transfer_between_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
-    data, run = trained
-    opened = open_dataset(str(data))
-    save_mesh(Mesh(opened.vertices(3, 7), opened.faces(3)), tmp_path / "pose.obj")
-    save_mesh(Mesh(opened.vertices(4, 0), opened.faces(4)), tmp_path / "person.ply")
-    paths = ("--source", tmp_path / "pose.obj", "--target", tmp_path / "person.ply", "--out", tmp_path / "posed.glb")
-    result = command("transfer", "--model", run, *paths)
-    assert result.returncode == 0, result.stderr
-    posed = load_mesh(tmp_path / "posed.glb")
-    assert np.array_equal(posed.faces, opened.faces(4)) and len(posed.vertices) == opened.vertices(4, 0).shape[0]
-
-
-def test_transfer_of_unusable_files(trained: tuple[Path, Path], tmp_path: Path) -> None:
-    _, run = trained
-    (tmp_path / "nan.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    (tmp_path / "junk.glb").write_bytes(b"junk")
-    (tmp_path / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 4 2\n")
-
-    def transfer(source: str, model: Path = run, out: str = "out.obj") -> subprocess.CompletedProcess[str]:
-        target = tmp_path / "good.obj"
-        return command(
-            "transfer", "--model", model, "--source", tmp_path / source, "--target", target, "--out", tmp_path / out
-        )
-
-    fails(transfer("none.obj"), 1, "no mesh file at", "none.obj")
-    fails(transfer("nan.obj"), 1, "nan.obj", "1 vertex is not finite")
-    fails(transfer("points.obj"), 1, "points.obj holds 3 vertices and no faces")
-    fails(transfer("junk.glb"), 1, "junk.glb", "cannot be read as GLB")
-    fails(
-        transfer("good.obj", model=tmp_path / "norun"),
-        1,
-        "norun: there is no such run or weights. Name one; these come along: animals, dressed, dsffnet-people, human",
-    )
-    fails(transfer("good.obj", out="out.xyz"), 1, "unknown mesh format '.xyz'")
-    assert not list(tmp_path.glob("out*"))
 
 
 def test_training_in_this_process_needs_neither_ray_nor_mlflow(trained: tuple[Path, Path], tmp_path: Path) -> None:

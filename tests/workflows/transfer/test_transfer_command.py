@@ -72,7 +72,8 @@ def test_a_pair_with_picture_and_page(
     assert files(tmp_path) == ["posed.html", "posed.obj", "posed.png"]
     source, target = load_mesh("pose.obj"), load_mesh("person.obj")
     expected = PoseTransfer.from_run(run)(source=source, target=target)
-    assert np.allclose(load_mesh(tmp_path / "posed.obj").vertices, expected.vertices, atol=1e-5)
+    posed = load_mesh(tmp_path / "posed.obj")
+    assert np.allclose(posed.vertices, expected.vertices, atol=1e-5) and np.array_equal(posed.faces, target.faces)
 
 
 def test_a_vertex_in_no_face_is_told_of_and_kept(
@@ -387,6 +388,7 @@ UNUSABLE: dict[str, tuple[NDArray[np.floating], NDArray[np.integer], str]] = {
     "not a number": (np.where(np.arange(COUNT)[:, None] == 5, np.nan, ROUND), TRIANGLES, "the first is number 5"),
     "infinite": (np.where(np.arange(COUNT)[:, None] == 5, np.inf, ROUND), TRIANGLES, "the first is number 5"),
     "one face, and points": (ROUND, TRIANGLES[:1], "all vertices lie in one slanted plane"),
+    "no faces": (ROUND, TRIANGLES[:0], "holds 42 vertices and no faces"),
     "a face beyond the last vertex": (ROUND, np.array([[0, 1, 99]]), "vertex 100, but there are 42"),
     "too large to be squared": (ROUND * 1e200, TRIANGLES, r"coordinates up to 1e\+200: scale it"),
     "too small to be squared": (ROUND * 1e-200, TRIANGLES, "long at most: scale it"),
@@ -492,7 +494,8 @@ def test_models_and_servers_that_are_not_there(run: Path, tmp_path: Path, monkey
         options = cli.parsed(["transfer", "pose.obj", "person.obj", "-o", str(tmp_path / "x.obj"), "--model", model])
         options.command(options)
 
-    with pytest.raises(CheckpointError, match="--model nowhere: there is no such run or weights"):
+    along = "Name one; these come along: animals, dressed, dsffnet-people, human"
+    with pytest.raises(CheckpointError, match=f"--model nowhere: there is no such run or weights. {along}"):
         call("nowhere")
     with pytest.raises(RecipeError, match="--tracking-uri"):
         call("models:/dsffnet@latest-trained")
