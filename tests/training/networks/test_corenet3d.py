@@ -209,25 +209,14 @@ def test_a_training_pass_iterates_once() -> None:
     torch.testing.assert_close(norm[0]._u, expected)
 
 
-def test_under_autocast_the_result_stays_close_and_float32() -> None:
+def test_under_autocast_features_cosines_and_transport_do_not_change() -> None:
     network = _network(torch.float32, feature_widths=(32, 64, 64), generator_widths=(128, 64, 32)).eval()
     inputs = _inputs(torch.float32, 200, 150)
-    with torch.no_grad():
-        full, warped = network(**inputs), _warped(network, inputs)
-        with torch.autocast("cpu", torch.bfloat16):
-            half, same = network(**inputs), _warped(network, inputs)
-    assert half.dtype == torch.float32
-    assert torch.equal(same, warped)  # features, cosines and transport do not change
-    assert 0 < (half - full).square().mean().sqrt() / full.std() < 0.03
-
-
-def test_training_under_autocast_gives_gradients_close_to_the_full_ones() -> None:
-    network = _network(torch.float32)
-    full = functional_gradients(network, _inputs(torch.float32))
+    warped, full = _warped(network, inputs), functional_gradients(network, inputs)["source"]
     with torch.autocast("cpu", torch.bfloat16):
-        half = functional_gradients(network, _inputs(torch.float32))
-    for name in ("source", "generator.block1.linear0.parametrizations.weight.original", "generator.out.weight"):
-        assert nn.functional.cosine_similarity(half[name].flatten(), full[name].flatten(), dim=0) > 0.98, name
+        same, half = _warped(network, inputs), functional_gradients(network, inputs)["source"]
+    assert torch.equal(same, warped)
+    assert nn.functional.cosine_similarity(half.flatten(), full.flatten(), dim=0) > 0.98
 
 
 def test_initial_values_are_those_of_the_table() -> None:
@@ -319,8 +308,3 @@ def test_missing_damaged_and_exchanged_files_are_refused(tmp_path: Path) -> None
     paths["generator"].write_bytes(paths["generator"].read_bytes()[:-2000])
     with pytest.raises(CheckpointError, match=r"latest_net_G\.pth cannot be loaded"):
         load_released_corenet3d(**paths)
-
-
-def test_errors_carry_the_shapes() -> None:
-    with pytest.raises(ValueError, match=r"equally many, got shapes \[2, 30, 3\] and \[3, 25, 3\]"):
-        _network()(source=_mesh(30), target=_mesh(25, batch=3))
