@@ -128,18 +128,7 @@ def test_files_that_are_no_model_are_refused_in_one_sentence(fault: str, save: A
     assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x05\x06", b"not a model", b"\x80\x04]."])
-def test_damaged_files_are_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
-    with pytest.raises(BodyError, match=r"SMPL_NEUTRAL\.npz"):
+def test_a_pickle_of_no_dictionary_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(b"\x80\x04].")
+    with pytest.raises(BodyError, match=r"SMPL_NEUTRAL\.npz holds list, not the dictionary"):
         SmplModel(SmplBody(path=str(tmp_path)))
-
-
-def test_a_truncated_npz_is_refused(tmp_path: Path) -> None:
-    whole = save_npz(tmp_path / "whole.npz", arrays_of("smpl")).read_bytes()
-    damaged = bytearray(whole)
-    damaged[len(whole) // 2] ^= 1
-    for content in (whole[: len(whole) // 2], bytes(damaged)):
-        (tmp_path / "SMPL_NEUTRAL.npz").write_bytes(content)
-        with pytest.raises(BodyError, match="copy or download it again"):
-            SmplModel(SmplBody(path=str(tmp_path)))

@@ -1,6 +1,5 @@
 """Poses from a file of one's own."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +11,11 @@ from datagen.poses import JOINTS, PARENTS, Poses, draw_poses, load_poses
 from datagen.poses.pose_files import read_pose_file, write_pose_file
 from datagen.poses.skeletons import SMAL_JOINTS, SMAL_PARENTS
 from datagen.recipe import PoseRecipe
-from tests.support.damage.archives import DAMAGES
 
 
 def recipe_of(path: Path, *, seen: int = 4, unseen: int = 2) -> PoseRecipe:
     values = {"seen": seen, "unseen": unseen, "distribution": {"name": "file", "path": str(path)}}
     return PoseRecipe.model_validate(values)
-
-
-def test_pickles_are_never_loaded(tmp_path: Path) -> None:
-    evil = np.array([{"a": 1}], dtype=object)
-    np.savez(tmp_path / "evil.npz", poses=evil, joints=np.array(["pelvis"]))
-    with pytest.raises(RecipeError, match=r"no \.npz file of plain arrays"):
-        load_poses(recipe_of(tmp_path / "evil.npz"))
 
 
 def test_poses_that_are_written_to_a_file_are_drawn_from_it(tmp_path: Path) -> None:
@@ -101,9 +92,6 @@ def test_pose_files_that_cannot_be_used(tmp_path: Path, arrays: dict[str, Any], 
 def test_no_pose_file(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"no pose file at .*write_pose_file makes one"):
         load_poses(recipe_of(tmp_path / "none.npz"))
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(RecipeError, match=r"text\.npz is no \.npz file"):
-        load_poses(recipe_of(tmp_path / "text.npz"))
     np.save(tmp_path / "array.npy", np.zeros((6, 24, 3)))
     with pytest.raises(RecipeError, match=r"array\.npy is no \.npz file"):
         load_poses(recipe_of(tmp_path / "array.npy"))
@@ -117,12 +105,3 @@ def test_a_pose_cannot_be_seen_and_unseen(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match=r"p\.npz: pose 5 is to be unseen, but equals pose 0, which is seen"):
         load_poses(recipe_of(tmp_path / "p.npz"))
     assert len(draw_poses(recipe_of(tmp_path / "p.npz", unseen=1), range(5))) == 5
-
-
-@pytest.mark.parametrize("damage", sorted(DAMAGES))
-def test_damaged_archives_are_one_error(tmp_path: Path, damage: str) -> None:
-    content = io.BytesIO()
-    np.savez_compressed(content, poses=np.random.default_rng(0).normal(size=(6, 1, 3)), joints=np.array(["pelvis"]))
-    (tmp_path / "p.npz").write_bytes(DAMAGES[damage](content.getvalue()))
-    with pytest.raises(RecipeError, match=r"p\.npz is no \.npz file of plain arrays \(.+\)"):
-        load_poses(recipe_of(tmp_path / "p.npz"))

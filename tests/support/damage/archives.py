@@ -14,6 +14,13 @@ def _overwritten(content: bytes) -> bytes:
     return content[:start] + b"\xff" * 40 + content[start + 40 :]
 
 
+def _flipped(content: bytes) -> bytes:
+    """One bit, which a checksum tells at the latest."""
+    changed = bytearray(content)
+    changed[content.index(b".npy") + 60] ^= 1
+    return bytes(changed)
+
+
 def _in_directory(offset: int, value: int) -> Damage:
     """A 16-bit field of every member, in the archive's directory and at the members themselves."""
 
@@ -42,7 +49,12 @@ def _lying_header(content: bytes) -> bytes:
 
 DAMAGES: dict[str, Damage] = {
     "overwritten": _overwritten,
+    "a bit flipped": _flipped,
     "cut off": lambda content: content[:-100],
+    "half of it": lambda content: content[: len(content) // 2],
+    "empty": lambda _: b"",
+    "text": lambda _: b"no archive",
+    "an end without a beginning": lambda _: b"PK\x05\x06",
     "encrypted": _in_directory(6, 1),
     "packed in an unknown way": _in_directory(8, 97),
     "a header of 1e13 rows": _lying_header,
