@@ -1,6 +1,5 @@
 """A headless Chromium, driven over its DevTools protocol; tests that need one are skipped where there is none."""
 
-import base64
 import itertools
 import json
 import shutil
@@ -134,10 +133,6 @@ class Browser:
         data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
         for kind in ("dragEnter", "dragOver", "drop"):
             self.call("Input.dispatchDragEvent", type=kind, x=place[0], y=place[1], data=data)
-
-    def picture(self, path: Path) -> None:
-        """Write what is seen as a PNG."""
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
 
 @contextmanager
