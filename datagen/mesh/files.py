@@ -71,7 +71,8 @@ def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = ()) -> MeshF
         faces without vertices, no extent, no thickness, too many vertices, geometries that are not one body.
     """
     read = _read(Path(path), geometries)
-    require_thickness(InFaces.checked(read.mesh, name=str(path)).mesh.vertices, read.path)
+    seen = InFaces.checked(read.mesh, name=str(path)).mesh
+    require_thickness(np.asarray(seen.vertices, np.float64), read.path)
     return read
 
 

@@ -55,7 +55,7 @@ def add_model_option(made: Parser) -> None:
 def _add_standing(made: Parser) -> None:
     made.add_argument("--align", action="store_true", help="find by the network how each mesh stands, and turn it")
     made.add_argument("--up", metavar="AXIS", help="towards the head: X Y Z -X -Y -Z (Y), or two: SOURCE,TARGET")
-    made.add_argument("--front", metavar="AXIS", help="where the body faces (Z), or two: SOURCE,TARGET")
+    made.add_argument("--front", metavar="AXIS", help="where the body faces (Z; -Y if Z is up), or two: SOURCE,TARGET")
 
 
 def _add_extras(made: Parser) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from datagen.common.files import read_bounded
 from datagen.mesh.formats.surface import Encoded, Format, Surface, numbers, numbers_in, shared_normals
-from datagen.mesh.geometries import require_known_names
+from datagen.mesh.geometries import require_known_names, require_one_body
 from datagen.mesh.limits import BYTE_LIMIT
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ _PATTERNS = {
 }
 _FACE = re.compile(rb"\s*f(?:\s+-?\d+(?:/-?\d*){0,2})*\s*")
 _SECTIONS = (b"o", b"g")
+_MOST_OBJECTS = 1_000  # that are asked whether they make one body
 _ELEMENTS = (b"v", b"vt", b"vn", b"f", b"usemtl", b"mtllib", b"o", b"g", b"s", b"l", b"p")
 
 
@@ -80,6 +81,21 @@ class ObjContent:
             for element in _SECTIONS
         )
         return objects if len(objects) > 1 else groups
+
+    @property
+    def extents(self) -> dict[str, NDArray[np.float64]]:
+        """Least and greatest coordinates [2, 3] of its objects that have faces, unless they are one or very many."""
+        names, (table, sizes) = self._names(b"o"), self._face_corners
+        if not 1 < len(names) <= _MOST_OBJECTS or not len(table) or table[:, 0].max() >= len(self.vertices):
+            return {}
+        object_of = np.repeat(self._section_of_face(b"o"), sizes)
+        found = dict[str, NDArray[np.float64]]()
+        for number, name in enumerate(names):
+            own = self.vertices[table[object_of == number, 0]]
+            if len(own):
+                both = [own, found[name]] if name in found else [own]
+                found[name] = np.array([extreme(np.concatenate(both), axis=0) for extreme in (np.min, np.max)])
+        return found
 
     def only(self, wanted: Sequence[str]) -> "ObjContent":
         """Return the objects and groups of these names, with the vertices of their faces alone.
@@ -371,13 +387,26 @@ def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str
 
 
 def read_obj(path: Path, geometries: Sequence[str]) -> ObjContent:
-    """Read a file as one mesh, or objects and groups of it by name (MeshError where it has none of that name)."""
-    content = ObjContent(read_bounded(path, limit=BYTE_LIMIT), path)
-    return content.only(geometries) if geometries else content
+    """Read a file as one mesh, or objects and groups of it by name.
+
+    Raises
+    ------
+    MeshError
+        It has none of that name; or, where none is named, objects that do not make one body.
+    """
+    content = _content(path)
+    if geometries:
+        return content.only(geometries)
+    require_one_body(content.extents, path)
+    return content
+
+
+def _content(path: Path) -> ObjContent:
+    return ObjContent(read_bounded(path, limit=BYTE_LIMIT), path)
 
 
 def _names(path: Path) -> tuple[str, ...]:
-    return read_obj(path, ()).sections
+    return _content(path).sections
 
 
 FORMATS = {".obj": Format(read_obj, _built, _names)}

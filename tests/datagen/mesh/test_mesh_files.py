@@ -49,7 +49,8 @@ def test_every_format_becomes_every_other_with_its_vertices_in_order(tmp_path: P
 def test_any_triangles_come_back_as_they_were(tmp_path_factory: pytest.TempPathFactory, seed: int, suffix: str) -> None:
     generator = np.random.default_rng(seed)
     vertices = generator.normal(size=(generator.integers(4, 30), 3)).astype(np.float32).astype(float)
-    faces = generator.integers(0, len(vertices), (generator.integers(1, 40), 3))
+    body = [[0, 1, 2], [0, 2, 3]]  # some of the others are in no face
+    faces = np.concatenate([body, generator.integers(0, len(vertices), (generator.integers(1, 40), 3))])
     read = saved(tmp_path_factory.mktemp("any"), suffix, Mesh(vertices, faces))
     assert np.allclose(read.mesh.vertices, vertices, rtol=1e-6, atol=1e-7) and np.array_equal(read.mesh.faces, faces)
     out = read.path.with_name(f"out{suffix}")
@@ -140,7 +141,8 @@ def test_too_many_vertices_are_counted_without_reading_everything(
     (tmp_path / "big.obj").write_text(lines + "f 1 2 3\n")
     with pytest.raises(MeshError, match=r"more than 1,000 vertices \(1,\d\d\d counted\)"):
         read_mesh_file(tmp_path / "big.obj")
-    (tmp_path / "just.obj").write_text("".join(lines.splitlines(keepends=True)[:1000]) + "f 1 2 3\n" * 900)
+    just = "".join(lines.splitlines(keepends=True)[:1000]) + "f 1 3 8\nf 1 8 10\n" * 450
+    (tmp_path / "just.obj").write_text(just)
     assert len(read_mesh_file(tmp_path / "just.obj").mesh.vertices) == 1000
     (tmp_path / "big.stl").write_bytes(bytes(80) + struct.pack("<I", 3000) + bytes(150_000))
     with pytest.raises(MeshError, match="decimate"):
@@ -207,7 +209,8 @@ def test_a_file_of_another_whose_name_only_begins_alike_is_left_alone(tmp_path: 
     """``p.obj`` says nothing of ``person.mtl``, which may be of another body; ``p.mtl`` is of an earlier output."""
     (tmp_path / "from").mkdir()
     (tmp_path / "from" / "person.mtl").write_text("newmtl skin\n")
-    (tmp_path / "from" / "person.obj").write_text("mtllib person.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
+    body = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+    (tmp_path / "from" / "person.obj").write_text("mtllib person.mtl\n" + body)
     (tmp_path / "person.mtl").write_text("of another body")
     read = read_mesh_file(tmp_path / "from" / "person.obj")
     (said,) = write_posed(read, read.mesh.vertices, tmp_path / "p.obj").left_out

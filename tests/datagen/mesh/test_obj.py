@@ -8,7 +8,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datagen.common.errors import MeshError
+from datagen.common.errors import MeshError, NotOneBodyError
 from datagen.mesh.files import geometry_names, read_mesh_file, write_posed
 from datagen.mesh.formats.obj import ObjContent, face_lines, vertex_lines
 from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
@@ -165,10 +165,10 @@ f -4//-1 -1//-1 -2//-1
 f 2 3 4
 l 1 2
 o tall hat
+v 0 1.05 0
+v 1 1.05 0
 v 0 2 0
-v 1 2 0
-v 0 3 0
-v 0 2 1
+v 0 1.05 1
 usemtl cloth
 g brim
 f 5 7 6
@@ -176,6 +176,14 @@ f -4/-1 -3/-2 -1/-3
 f 5 8 7
 f 6 7 8
 """
+
+
+def test_objects_that_make_no_body_are_refused_by_name_and_can_be_chosen(tmp_path: Path) -> None:
+    path = golden("cube.obj", tmp_path).with_name("apart.obj")
+    path.write_bytes(TWO.replace(b" 1.05 ", b" 9.05 ").replace(b"v 0 2 0", b"v 0 10 0"))
+    with pytest.raises(NotOneBodyError, match=r"'body', 'tall hat', which do not make one body \(apart: 'tall hat'\)"):
+        read_mesh_file(path)
+    assert geometry_names(path) == ("body", "tall hat") and len(read_mesh_file(path, geometries=["body"]).mesh.faces)
 
 
 @pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
