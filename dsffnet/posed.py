@@ -17,7 +17,7 @@ from datagen.mesh.files import MeshFile, read_mesh_file, write_posed
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Alone, Encoded, Surface
 from datagen.mesh.geometries import CHOOSE, require_one_body
-from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
 from training.inference.orientation import axes_of_both
 from workflows.cli.transfer import weights_of
@@ -143,11 +143,11 @@ def _job(read: list[MeshFile], options: Options) -> TransferJob:
 def _mesh_file(given: Any, role: str) -> MeshFile:
     """A mesh as a file that was read: from its path, or from vertices and triangles in memory."""
     if isinstance(given, str | os.PathLike):
-        return read_mesh_file(Path(given))
+        return read_mesh_file(Path(given), is_body=True)
     mesh = check_mesh(_mesh(given, role), name=role)
     if len(mesh.vertices) > VERTEX_LIMIT:
         raise MeshError(f"{role} has {len(mesh.vertices):,} vertices, more than {VERTEX_LIMIT:,}: decimate it")
-    require_thickness(mesh.vertices.astype(np.float64), Path(role))
+    require_thickness(InFaces.checked(mesh, name=role).mesh.vertices.astype(np.float64), Path(role))
     return MeshFile(Path(role), role, mesh, _InMemory(mesh))
 
 

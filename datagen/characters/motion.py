@@ -14,7 +14,7 @@ from datagen.mesh.files import MeshFile
 from datagen.mesh.formats.glb import GlbContent, solid_nodes
 from datagen.mesh.formats.gltf import Gltf, reading
 from datagen.mesh.geometries import listed
-from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.geometry import InFaces, Mesh
 from datagen.mesh.limits import FRAME_LIMIT, require_thickness
 
 _PATHS = ("rotation", "translation", "scale", "weights")
@@ -84,8 +84,8 @@ class Motion:
         with reading(self.file.path, f"animation {self.clip.name!r}"):
             weights = {node: track.at(time) for node, track in self.clip.of("weights").items()}
             vertices = self._content.moved(self._world(time), weights)
-        mesh = check_mesh(Mesh(vertices, self.file.mesh.faces), name=where)
-        require_thickness(vertices, Path(where))
+        mesh = Mesh(vertices, self.file.mesh.faces)
+        require_thickness(np.asarray(InFaces.checked(mesh, name=where).mesh.vertices, np.float64), Path(where))
         return mesh
 
     @cached_property

@@ -25,6 +25,7 @@ from datagen.common.errors import BodyError, MeshError, StorageError, storage_er
 from datagen.common.files import write_atomically
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Content, Encoded, one_word
+from datagen.mesh.geometries import require_one_body
 from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from datagen.mesh.limits import DAMAGE, refuse_huge, require_file, require_known, require_thickness
 
@@ -59,10 +60,11 @@ class MeshFile:
         return self.content.geometries
 
 
-def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = ()) -> MeshFile:
+def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = (), is_body: bool = False) -> MeshFile:
     """Read a mesh file (OBJ, PLY, GLB, OFF or STL) with all that is needed to write it again.
 
-    ``geometries`` names those to take of a GLB scene, or groups and objects of an OBJ; by default all are one mesh.
+    ``geometries`` names those to take of a GLB scene, or groups and objects of an OBJ; by default all are one mesh. Of
+    what is to be a body objects of an OBJ are refused that do not make one, as geometries of a GLB always are.
 
     Raises
     ------
@@ -73,6 +75,8 @@ def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = ()) -> MeshF
     read = _read(Path(path), geometries)
     seen = InFaces.checked(read.mesh, name=str(path)).mesh
     require_thickness(np.asarray(seen.vertices, np.float64), read.path)
+    if is_body and not geometries and isinstance(extents := getattr(read.content, "extents", None), dict):
+        require_one_body(extents, read.path)
     return read
 
 

@@ -5,6 +5,7 @@ A person's own files, with all that is in them, are read and written by :mod:`da
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,7 +174,7 @@ def triangles_of(quads: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-_ONE_PLACE = 3e-6  # of the longest edge of the box: more than six decimals leave of a body in metres
+_ONE_PLACE = 3e-6  # of the size of the body: more than six decimals leave of one in metres
 
 
 def places_of(vertices: Floats) -> NDArray[np.int64]:
@@ -183,13 +184,20 @@ def places_of(vertices: Floats) -> NDArray[np.int64]:
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
 
     points, point_of = np.unique(vertices, axis=0, return_inverse=True)
-    near = cKDTree(points).query_pairs(_ONE_PLACE * float(np.ptp(points, axis=0).max()), output_type="ndarray")
-    links = coo_array((np.ones(len(near), np.bool_), near.T), shape=(len(points), len(points)))
-    place_of = connected_components(links, directed=False)[1]
-    return np.asarray(place_of[point_of.ravel()], np.int64)
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)  # a few vertices far away are no measure of the body
+    if not (cell := 2 * _ONE_PLACE * float((high - low).max())) > 0:
+        return np.asarray(point_of.ravel(), np.int64)
+    links = list[NDArray[np.int64]]()
+    for shift in product((0.0, 0.5), repeat=3):  # what is nearer than half a cell shares one in some of these grids
+        cells = np.floor((points - low) / cell + shift)
+        order = np.lexsort(cells.T)
+        shared = (cells[order[1:]] == cells[order[:-1]]).all(axis=1)
+        links.append(np.stack([order[:-1][shared], order[1:][shared]]))
+    both = np.concatenate(links, axis=1)
+    graph = coo_array((np.ones(both.shape[1], np.bool_), both), shape=(len(points), len(points)))
+    return np.asarray(connected_components(graph, directed=False)[1][point_of.ravel()], np.int64)
 
 
 def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:

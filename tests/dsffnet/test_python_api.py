@@ -62,6 +62,7 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
         ((good.vertices, [[0, 1, 10**6]]), "target: faces name vertex 1000000, but there are"),
         ((good.vertices * np.nan, good.faces), "target: .* vertices are not finite"),
         ((flat, good.faces), "target is flat: it has no thickness along z"),
+        ((np.concatenate([flat, [[0, 0, 5]]]), good.faces), "target is flat: it has no thickness along z"),
         (tmp_path / "no.obj", "no.obj"),
         (7, "target is a int"),
         ((torch.tensor(good.vertices, requires_grad=True), good.faces), "target is a tuple; .*requires grad"),

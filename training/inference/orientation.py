@@ -106,11 +106,11 @@ def axes_of_both(up: str | None, front: str | None) -> tuple[Axes, Axes]:
     RecipeError
         A name is no axis, or there are more than two.
     """
-    up = up or UPRIGHT.up
-    front = front or ",".join("-Y" if name[-1:] == "Z" else UPRIGHT.front for name in up.upper().split(","))
-    ups, fronts = (names.upper().split(",") for names in (up, front))
+    ups = (up or UPRIGHT.up).upper().split(",")
+    fronts = front.upper().split(",") if front else ["-Y" if name[-1:] == "Z" else UPRIGHT.front for name in ups]
     if max(len(ups), len(fronts)) > 2:
-        raise RecipeError(f"--up={up} --front={front}: name one axis, or two with a comma, of source and target")
+        said = f"--up={up or UPRIGHT.up} --front={front or UPRIGHT.front}"
+        raise RecipeError(f"{said}: name one axis, or two with a comma, of source and target")
     return Axes(ups[0], fronts[0]), Axes(ups[-1], fronts[-1])
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
 from datagen.common.errors import CheckpointError, MeshError
-from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.geometry import InFaces, Mesh
 from training.inference.predict import load_trained
 from training.inference.standing import MISREAD, facing, sampled, standing, understanding_of
 from training.networks.parts import Parts
@@ -65,7 +65,7 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
     """Rotations [part, 3, 3] of each mesh, Y up, facing +Z at rest."""
     understand, axes, turn = understanding_of(network), None, np.eye(3)
     for number, each in enumerate(meshes):
-        mesh = check_mesh(each, name=f"mesh {number}")
+        mesh = InFaces.checked(each, name=f"mesh {number}").mesh
         if axes is None:  # the others may turn round and bend
             axes = standing(understand, mesh.vertices)
             turn = axes.lean

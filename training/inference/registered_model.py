@@ -22,13 +22,13 @@ from mlflow.pyfunc import PythonModel
 
 from datagen.common.errors import DsffnetError, MeshError, RecipeError, RegistryError
 from datagen.mesh.files import read_mesh_file
-from datagen.mesh.geometry import Mesh, check_mesh
+from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from training.inference.orientation import Axes, axes_of_both, orientation
 from training.inference.transfer import PoseTransfer
 from training.tracking.mlflow_store import prepare_store, sqlite_file, sqlite_server
 
 _BAR = "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR"
-_DEFAULTS: dict[str, Any] = {"up": "Y", "front": "Z", "align": False, "refine": 0.0}
+_DEFAULTS: dict[str, Any] = {"up": "Y", "front": "", "align": False, "refine": 0.0}
 
 
 class PoseTransferModel(PythonModel):  # type: ignore[misc]
@@ -63,14 +63,14 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         return np.asarray(posed.vertices)
 
     def _axes(self, source: Mesh, target: Mesh, wanted: Mapping[str, Any]) -> tuple[Axes | None, Axes | None]:
-        if self._transfer.finds_standing and (wanted["up"], wanted["front"]) == ("Y", "Z"):
+        if self._transfer.finds_standing and wanted["up"] == "Y" and wanted["front"] in ("", "Z"):
             return None, None
         if not wanted["align"]:
             return axes_of_both(str(wanted["up"]), str(wanted["front"]))
         return self._found(source, "source"), self._found(target, "target")
 
     def _found(self, mesh: Mesh, role: str) -> Axes:
-        way = orientation(self._transfer.self_errors, [mesh.vertices])
+        way = orientation(self._transfer.self_errors, [InFaces(mesh).mesh.vertices])
         if not way.is_certain:
             warnings.warn(f"how the {role} stands is not certain: it is taken as it lies", stacklevel=4)
         return way.axes

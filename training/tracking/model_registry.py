@@ -146,7 +146,7 @@ def _signature() -> Any:
     real, whole = np.dtype(np.float64), np.dtype(np.int64)
     names = {"source": real, "target": real, "target_faces": whole}
     inputs = Schema([TensorSpec(kind, (-1, 3), name) for name, kind in names.items()])
-    options = {"up": ("string", "Y"), "front": ("string", "Z"), "align": ("boolean", False), "refine": ("double", 0.0)}
+    options = {"up": ("string", "Y"), "front": ("string", ""), "align": ("boolean", False), "refine": ("double", 0.0)}
     params = ParamSchema([ParamSpec(name, *kind_and_default) for name, kind_and_default in options.items()])
     return ModelSignature(inputs=inputs, outputs=Schema([TensorSpec(real, (-1, 3), "vertices")]), params=params)
 

@@ -21,7 +21,7 @@ from datagen.common.errors import DsffnetError, MeshError, RecipeError
 from datagen.common.resources import ran_out_of_memory
 from datagen.mesh.files import MeshFile, read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh, bounding_box
-from training.inference.orientation import UPRIGHT, Axes
+from training.inference.orientation import UPRIGHT, Axes, axes_of_both
 from training.inference.standing import Standing
 from training.inference.transfer import PoseTransfer
 from training.objectives.metrics import recentred_point_mesh_distance
@@ -249,7 +249,7 @@ def _files_of(body: Body, folder: Path, *, moving: bool = False, animation: str 
 
 def read(path: Path, geometries: Sequence[str] = ()) -> MeshFile:
     """As ``dsffnet transfer`` reads it; MeshError also where it has more vertices than the page takes."""
-    return within_limit(read_mesh_file(path, geometries=geometries))
+    return within_limit(read_mesh_file(path, geometries=geometries, is_body=True))
 
 
 def within_limit(file: MeshFile) -> MeshFile:
@@ -271,7 +271,8 @@ def _job(asked: Asked, sources: list[Path], target: Path, folder: Path, *, named
     made_up = [isinstance(body, Figure) for body in (asked.source, asked.target)]
     if any(made_up) and (all(made_up) or options.up or options.front):  # what is chosen is said of one's own mesh
         options.up = ",".join(UPRIGHT.up if known else options.up or UPRIGHT.up for known in made_up)
-        options.front = ",".join(UPRIGHT.front if known else options.front or UPRIGHT.front for known in made_up)
+        own = axes_of_both(asked.switches.up, asked.switches.front)[0]
+        options.front = ",".join(UPRIGHT.front if known else own.front for known in made_up)
         options.align = options.align and not all(made_up)
     if not asked.moving:
         options.smooth = "0"
@@ -286,7 +287,7 @@ def clash_of(source: Body, target: Body, switches: Switches) -> str | None:
     if isinstance(source, Figure) and isinstance(target, Figure):
         return None
     try:
-        Axes(switches.up or UPRIGHT.up, switches.front or UPRIGHT.front)
+        axes_of_both(switches.up, switches.front)
     except RecipeError as error:
         return str(error)
     return None

@@ -127,7 +127,7 @@ class TransferJob:
         """The source, or a frame of the sequence."""
         if self.animation is not None:
             return replace(self._motion.file, mesh=self._motion.mesh(number))
-        return read_mesh_file(self.sources[number], geometries=self.source_geometry)
+        return read_mesh_file(self.sources[number], geometries=self.source_geometry, is_body=True)
 
     @cached_property
     def _motion(self) -> Motion:
@@ -137,7 +137,7 @@ class TransferJob:
 
     def read_target(self) -> MeshFile:
         """The target with all that is needed to write it again."""
-        return read_mesh_file(self.target, geometries=self.target_geometry)
+        return read_mesh_file(self.target, geometries=self.target_geometry, is_body=True)
 
     def check_places(self) -> None:
         """Refuse, before any work, what could not be written at its end, or would write over what is read.
@@ -212,5 +212,9 @@ def _frames_of_window(word: str, fps: float) -> int:
         raise RecipeError(f"--smooth {word!r} is neither a number of frames such as 7 nor a time such as 0.2s")
     frames = int(found[1]) if found[1] else round(float(found[2]) * fps)
     if frames < _FEWEST_SMOOTHED and float(found[1] or found[2]) > 0:
-        raise RecipeError(f"--smooth {word!r} takes {frames} frames: fewer than {_FEWEST_SMOOTHED} smooth nothing")
+        least = _FEWEST_SMOOTHED if found[1] else f"{_FEWEST_SMOOTHED / fps:.2g}s"
+        raise RecipeError(
+            f"--smooth {word!r} takes {frames} frames: fewer than {_FEWEST_SMOOTHED} smooth nothing. At {fps:g} frames "
+            f"a second take {least} or more, or 0"
+        )
     return frames

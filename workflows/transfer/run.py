@@ -6,6 +6,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -289,15 +290,21 @@ class TransferWork:
 
     @cached_property
     def _source_look(self) -> "Look | None":
-        from training.viz.look import look_of
-
-        return look_of(self.job.read_source(0).content.surface)
+        return _look(self.job.read_source(0))
 
     @cached_property
     def _target_look(self) -> "Look | None":
-        from training.viz.look import look_of
+        return _look(self.target)
 
-        return look_of(self.target.content.surface)
+
+def _look(file: MeshFile) -> "Look | None":
+    """How a file's faces look, of what is seen of it."""
+    from training.viz.look import look_of
+
+    look, seen = look_of(file.content.surface), InFaces(file.mesh)
+    if look is None or look.colors is None or not look.fits(len(file.mesh.vertices), len(file.mesh.faces)):
+        return look
+    return replace(look, colors=look.colors[seen.rows])
 
 
 def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None") -> "NamedMesh":

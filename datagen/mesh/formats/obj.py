@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from datagen.common.files import read_bounded
 from datagen.mesh.formats.surface import Encoded, Format, Surface, numbers, numbers_in, shared_normals
-from datagen.mesh.geometries import require_known_names, require_one_body
+from datagen.mesh.geometries import require_known_names
 from datagen.mesh.limits import BYTE_LIMIT
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _PATTERNS = {
     (0, 2): re.compile(rb"\s*f(?:\s+-?\d+//-?\d+)+\s*"),
     (0, 1, 2): re.compile(rb"\s*f(?:\s+-?\d+/-?\d+/-?\d+)+\s*"),
 }
-_FACE = re.compile(rb"\s*f(?:\s+-?\d+(?:/-?\d*){0,2})*\s*")
+_FACE = re.compile(rb"\s*f(?:\s+-?\d{1,18}(?:/(?:-?\d{1,18})?){0,2})*\s*")
 _SECTIONS = (b"o", b"g")
 _MOST_OBJECTS = 1_000  # that are asked whether they make one body
 _ELEMENTS = (b"v", b"vt", b"vn", b"f", b"usemtl", b"mtllib", b"o", b"g", b"s", b"l", b"p")
@@ -85,17 +85,18 @@ class ObjContent:
     @property
     def extents(self) -> dict[str, NDArray[np.float64]]:
         """Least and greatest coordinates [2, 3] of its objects that have faces, unless they are one or very many."""
-        names, (table, sizes) = self._names(b"o"), self._face_corners
-        if not 1 < len(names) <= _MOST_OBJECTS or not len(table) or table[:, 0].max() >= len(self.vertices):
-            return {}
+        names, (table, sizes) = [*self._names(b"o"), ""], self._face_corners
         object_of = np.repeat(self._section_of_face(b"o"), sizes)
-        found = dict[str, NDArray[np.float64]]()
-        for number, name in enumerate(names):
-            own = self.vertices[table[object_of == number, 0]]
-            if len(own):
-                both = [own, found[name]] if name in found else [own]
-                found[name] = np.array([extreme(np.concatenate(both), axis=0) for extreme in (np.min, np.max)])
-        return found
+        order = np.argsort(object_of, kind="stable")
+        numbers, starts = np.unique(object_of[order], return_index=True)
+        if not 1 < len(numbers) <= _MOST_OBJECTS:
+            return {}
+        corners = self.vertices[table[order, 0]]
+        both = np.stack([extreme.reduceat(corners, starts) for extreme in (np.minimum, np.maximum)], axis=1)
+        known = [names[number] or "unnamed" for number in numbers]
+        again = [known[:place].count(name) for place, name in enumerate(known)]
+        titles = [f"{name} ({count + 1})" if count else name for name, count in zip(known, again, strict=True)]
+        return dict(zip(titles, both, strict=True))
 
     def only(self, wanted: Sequence[str]) -> "ObjContent":
         """Return the objects and groups of these names, with the vertices of their faces alone.
@@ -156,8 +157,11 @@ class ObjContent:
         """Numbers [corner, 3] of vertex, texture coordinate and normal (-1 for none), and corners of each face."""
         try:
             table, sizes = _corners(self._of(b"f"))
-        except ValueError:
-            wrong = next(n for n, line in enumerate(self._of(b"f")) if not _FACE.fullmatch(line.partition(b"#")[0]))
+        except (ValueError, OverflowError):
+            lines = self._of(b"f")
+            wrong = next((n for n, line in enumerate(lines) if not _FACE.fullmatch(line.partition(b"#")[0])), None)
+            if wrong is None:
+                raise
             line = self._of(b"f")[wrong].decode("utf-8", "replace")
             raise ValueError(f"line {self._at[b'f'][wrong] + 1} is no face: {line[:60]!r}") from None
         line_of = np.repeat(np.array(self._at[b"f"], np.int64), sizes)
@@ -387,26 +391,13 @@ def _built(surface: Surface, vertices: NDArray[np.float64], name: str, stem: str
 
 
 def read_obj(path: Path, geometries: Sequence[str]) -> ObjContent:
-    """Read a file as one mesh, or objects and groups of it by name.
-
-    Raises
-    ------
-    MeshError
-        It has none of that name; or, where none is named, objects that do not make one body.
-    """
-    content = _content(path)
-    if geometries:
-        return content.only(geometries)
-    require_one_body(content.extents, path)
-    return content
-
-
-def _content(path: Path) -> ObjContent:
-    return ObjContent(read_bounded(path, limit=BYTE_LIMIT), path)
+    """Read a file as one mesh, or objects and groups of it by name (MeshError where it has none of that name)."""
+    content = ObjContent(read_bounded(path, limit=BYTE_LIMIT), path)
+    return content.only(geometries) if geometries else content
 
 
 def _names(path: Path) -> tuple[str, ...]:
-    return _content(path).sections
+    return read_obj(path, ()).sections
 
 
 FORMATS = {".obj": Format(read_obj, _built, _names)}

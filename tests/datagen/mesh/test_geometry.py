@@ -66,6 +66,13 @@ def test_vertices_at_one_place_but_for_rounding_share_its_number() -> None:
     assert others[2] not in (first, second, third, fourth)
 
 
+def test_a_face_far_away_does_not_make_the_others_one_place() -> None:
+    body = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
+    far = np.concatenate([body, body[:1] + 1e6, body[:1] + 1e6 + 1e-7])
+    numbers = places_of(far)
+    assert len(np.unique(numbers[:20_000])) > 19_990 and numbers[-1] == numbers[-2]
+
+
 @pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".stl"}))
 def test_files_keep_vertices_and_their_order(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"mesh{suffix}"

@@ -178,11 +178,20 @@ f 6 7 8
 """
 
 
+@pytest.mark.parametrize("face", ["1/- 2 3", "1 2 x", "1.0 2.0 3.0", "99999999999999999999/1 2/1 3/1"])
+def test_the_line_of_a_broken_face_is_named(tmp_path: Path, face: str) -> None:
+    path = tmp_path / "broken.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\nf {face}\n")
+    with pytest.raises(MeshError, match="line 6 is no face: 'f "):
+        read_mesh_file(path)
+
+
 def test_objects_that_make_no_body_are_refused_by_name_and_can_be_chosen(tmp_path: Path) -> None:
     path = golden("cube.obj", tmp_path).with_name("apart.obj")
     path.write_bytes(TWO.replace(b" 1.05 ", b" 9.05 ").replace(b"v 0 2 0", b"v 0 10 0"))
     with pytest.raises(NotOneBodyError, match=r"'body', 'tall hat', which do not make one body \(apart: 'tall hat'\)"):
-        read_mesh_file(path)
+        read_mesh_file(path, is_body=True)
+    assert len(read_mesh_file(path).mesh.vertices) == 8, "of what is no body, as armour, all is one mesh"
     assert geometry_names(path) == ("body", "tall hat") and len(read_mesh_file(path, geometries=["body"]).mesh.faces)
 
 

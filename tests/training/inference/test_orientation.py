@@ -92,7 +92,8 @@ def test_no_more_than_256_vertices_are_looked_at_in_the_box_of_all() -> None:
 
 def test_axes_of_one_or_both_meshes_by_hand() -> None:
     assert axes_of_both("z", "-y") == (Axes("Z", "-Y"), Axes("Z", "-Y"))
-    assert axes_of_both("Z,Y", "-Y,Z") == (Axes("Z", "-Y"), UPRIGHT)
+    assert axes_of_both("Z,Y", "-Y,Z") == axes_of_both("Z,Y", None) == (Axes("Z", "-Y"), UPRIGHT)
+    assert axes_of_both(None, None) == (UPRIGHT, UPRIGHT) and axes_of_both(None, "X")[0] == Axes("Y", "X")
 
 
 @pytest.mark.parametrize(

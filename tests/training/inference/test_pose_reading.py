@@ -44,6 +44,15 @@ def test_the_pose_of_a_person_is_read() -> None:
     quarter = Rotation.from_euler("y", 90, degrees=True)
     (turned,) = read_poses(own_weights("human"), [Mesh(quarter.apply(meshes[1].vertices), meshes[1].faces)]).rotations
     assert np.degrees((Rotation.from_rotvec(turned[0])).magnitude()) < 30, "people are read as they face"
+    loose = Mesh(np.concatenate([meshes[1].vertices, [[0, 8, 0]]]), meshes[1].faces)
+    (same,) = read_poses(own_weights("human"), [loose]).rotations
+    assert (
+        np.array_equal(same, found.rotations[1])
+        or degrees_between(
+            Poses(found.joints, found.parents, same[None]), Poses(found.joints, found.parents, found.rotations[1:2])
+        ).max()
+        < 12
+    ), "a vertex in no face is not read"
 
 
 def test_what_is_no_person_and_weights_that_read_no_poses_are_refused() -> None:

@@ -67,6 +67,7 @@ def test_refining_and_axes_are_those_of_the_command(
     assert np.allclose(model.predict(None, files(folder), {"refine": 6.0}), refined, atol=1e-6)
     lying = arrays | {"target": axes.restored(arrays["target"])}
     found = model.predict(None, lying, {"up": "Y,Z", "front": "Z,-Y"})
+    assert np.array_equal(model.predict(None, lying, {"up": "Y,Z"}), found), "where Z is up, -Y is the front"
     assert np.allclose(axes.turned(found), model.predict(None, arrays), atol=1e-5)
 
 

@@ -333,10 +333,11 @@ def test_up_and_front_are_said_of_ones_own_mesh_alone(
         assert np.allclose(shown.vertices, own.vertices, atol=1e-4)
 
 
-def test_up_alone_waits_for_front(legs: list[Path]) -> None:
+def test_up_and_front_along_one_line_wait_for_another(legs: list[Path]) -> None:
     made_up, own = Figure(PERSON, (0.5,) * 6, Pose(1.0)), (legs[0],)
-    assert "cannot have Z up and face Z" in (clash_of(made_up, own, Switches(up="Z")) or "")
+    assert "cannot have Z up and face Z" in (clash_of(made_up, own, Switches(up="Z", front="Z")) or "")
     assert clash_of(made_up, own, Switches(up="Z", front="-Y")) is None
+    assert clash_of(made_up, own, Switches(up="Z")) is None, "it faces -Y then"
     assert clash_of(made_up, made_up, Switches(up="Z")) is None
 
 

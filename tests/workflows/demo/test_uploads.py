@@ -63,7 +63,8 @@ def test_nothing_of_a_zip_leaves_its_folder(tmp_path: Path, place: str) -> None:
 
 
 def test_textures_of_a_zip_are_found_in_folders_and_by_names_with_spaces(tmp_path: Path) -> None:
-    mesh = b"mtllib My Body.mtl\nvt 0 0\nusemtl skin\n" + TRIANGLE.replace(b"f 1 2 3", b"v 0 0 1\nf 1/1 2/1 3/1")
+    body = TRIANGLE.replace(b"f 1 2 3", b"v 0 0 1\nf 1/1 2/1 3/1\nf 1/1 2/1 4/1")
+    mesh = b"mtllib My Body.mtl\nvt 0 0\nusemtl skin\n" + body
     library = b"newmtl skin\nmap_Kd textures/The Skin.PNG\n"
     content = zipped({"b/My Body.obj": mesh, "b/My Body.mtl": library, "b/textures/The Skin.PNG": b"\x89PNG"})
     read = read_mesh_file(keep("person.zip", content, tmp_path / "t", most=1)[0])

@@ -25,7 +25,9 @@ from training.engine.trainer import train
 from training.inference.orientation import Axes
 from training.inference.transfer import PoseTransfer
 from training.viz import viewer
+from training.viz.look import Look
 from workflows.cli import main as cli
+from workflows.transfer import run as transfer_run
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
 
@@ -77,12 +79,26 @@ def test_a_pair_with_picture_and_page(
 
 
 def test_a_vertex_in_no_face_is_told_of_and_kept(
-    transfer: Transfer, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    transfer: Transfer,
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     transfer("pose.obj", "person.obj", "-o", tmp_path / "plain.obj")
     loose = tmp_path / "loose.obj"
-    loose.write_text((run.parent / "person.obj").read_text() + "\nv 9 9 9\n")
+    lines = [*(run.parent / "person.obj").read_text().splitlines(), "v 9 9 9"]
+    loose.write_text("\n".join(f"{line} 1 0 0" if line.startswith("v ") else line for line in lines) + "\n")
+    drawn = list[NDArray[np.floating] | None]()
+
+    def shown(mesh: Mesh, axes: object, path: Path, look: Look | None) -> object:
+        drawn.append(None if look is None else look.colors)
+        return real(mesh, axes, path, look)
+
+    real = transfer_run._upright
+    monkeypatch.setattr(transfer_run, "_upright", shown)
     transfer("pose.obj", loose, "-o", tmp_path / "posed.obj", "--picture")
+    assert any(colours is not None and len(colours) == 32 for colours in drawn), "vertex colours are drawn all the same"
     assert "loose.obj is 1 vertex in no face (number 32, counted from 0)" in capsys.readouterr().err
     plain, posed = (load_mesh(tmp_path / name).vertices for name in ("plain.obj", "posed.obj"))
     assert len(posed) == 33 and np.allclose(posed[:-1], plain, atol=1e-6) and posed[-1].min() > 5
@@ -275,8 +291,8 @@ def test_an_animation_of_a_glb_is_posed_as_its_frames_in_files(
     mesh_sequences.write_animation(frames[0], [each.mesh.vertices for each in frames], walk, frames_per_second=30)
     transfer(walk, "person.obj", "-o", tmp_path / "one.obj")
     assert "walk.glb is taken at rest; --animation NAME poses every frame of 'poses'" in capsys.readouterr().out
-    transfer(walk, "person.obj", "--animation", "poses", "-o", tmp_path / "frames", "--smooth", "3")
-    transfer("walk", "person.obj", "-o", tmp_path / "expected", "--smooth", "3")
+    transfer(walk, "person.obj", "--animation", "poses", "-o", tmp_path / "frames", "--smooth", "5")
+    transfer("walk", "person.obj", "-o", tmp_path / "expected", "--smooth", "5")
     for number in range(12):
         found = load_mesh(tmp_path / "frames" / f"walk-{number:04d}.obj").vertices
         assert np.allclose(found, load_mesh(tmp_path / "expected" / f"frame_{number}.obj").vertices, atol=2e-4)
@@ -466,6 +482,8 @@ def test_more_frames_than_an_animation_holds_are_said_before_any_is_made(
         (("pose.obj", "person.obj", "-o", "x.obj", "--up", "W"), RecipeError, "'W' is no axis"),
         (("pose.obj", "person.obj", "-o", "x.obj", "--align", "--up", "Z"), RecipeError, "--align finds"),
         (("walk", "person.obj", "-o", "x.glb", "--smooth", "much"), RecipeError, "'much'"),
+        (("walk", "person.obj", "-o", "x.glb", "--smooth", "0.1s"), RecipeError, "takes 3 frames.* 0.13s or more"),
+        (("walk", "person.obj", "-o", "x.mp4"), MeshError, "not into one .mp4; choose --out x.glb or --out x"),
         (("pose.obj", "person.obj", "-o", "x.obj", "--smooth", "7"), RecipeError, "pose.obj is one mesh"),
         (("walk", "person.obj", "-o", "x.glb", "--animation", "a"), RecipeError, "walk is frames: leave it out"),
         (("pose.obj", "person.obj", "-o", "x.glb", "--animation", "a"), MeshError, "pose.obj has no animation 'a'"),

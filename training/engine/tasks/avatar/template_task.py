@@ -145,7 +145,7 @@ class OccupancyValidation(Validation):
 
     def decisive(self, metrics: dict[str, float]) -> float:
         """What is missing to a whole intersection."""
-        return 1 - super().decisive(metrics)
+        return 1 - super().decisive(metrics) if metrics else 1.0
 
 
 def template_network(recipe: TemplateRecipe, outfit: Outfit) -> OccupancyTemplate:
