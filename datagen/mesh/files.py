@@ -75,8 +75,11 @@ def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = (), is_body:
     read = _read(Path(path), geometries)
     seen = InFaces.checked(read.mesh, name=str(path)).mesh
     require_thickness(np.asarray(seen.vertices, np.float64), read.path)
-    if is_body and not geometries and isinstance(extents := getattr(read.content, "extents", None), dict):
-        require_one_body(extents, read.path)
+    if is_body and not geometries and read.path.suffix.lower() == ".obj":
+        from datagen.mesh.formats.obj import ObjContent
+
+        assert isinstance(read.content, ObjContent)
+        require_one_body(read.content.extents, read.path)
     return read
 
 
