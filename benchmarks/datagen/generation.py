@@ -16,7 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,15 @@ from threadpoolctl import threadpool_limits
 
 from datagen.bodies import load_body
 from datagen.common.seeding import Stream, generator
-from datagen.generate import ensure_shards, generate
+from datagen.generate import ensure_shards, generate, ray_runner
 from datagen.generate.plan import prepare
+from datagen.generate.shards import batches
 from datagen.grid import Shard
 from datagen.mesh.rig import part_transforms
 from datagen.poses import draw_poses
 from datagen.recipe import DatasetRecipe
 
-POSES, SHARDS, ROUNDS, ONE_AT_A_TIME = 100, 4, 7, 10
-_TIMED = 4
+POSES, SHARDS, ROUNDS, ONE_AT_A_TIME, TURNS = 100, 4, 7, 10, 8
 
 
 def recipe_of(topology: str, identities: int = SHARDS * ROUNDS, poses: int = POSES) -> DatasetRecipe:
@@ -177,33 +178,56 @@ def memory(topology: str) -> None:
 
 
 def scaling(topology: str, identities: int) -> None:
-    """Whole shards a second on one and on two Ray workers: medians, as new pages of files cost what they like."""
-    recipe, rates = recipe_of(topology, identities), dict[int, list[float]]()
-    for workers in (1, 2, 1, 2):
-        rates.setdefault(workers, []).extend(_on_workers(recipe, workers))
-    one, two = (statistics.median(rates[workers]) for workers in (1, 2))
-    print(f"\nRay workers, {topology}: one {one:,.0f} meshes/s, two {two:,.0f} meshes/s, x{two / one:.2f}", flush=True)
-
-
-def _on_workers(recipe: DatasetRecipe, workers: int) -> list[float]:
-    """Meshes a second by workers that have made as many once before."""
+    """Whole shards a second on one and on two Ray workers, in turns, as new pages of files cost what they like."""
     import ray
 
-    from datagen.generate import ray_runner
-    from datagen.generate.shards import batches
-
-    rates = []
-    ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
-    for _ in range(1 + _TIMED):
-        with tempfile.TemporaryDirectory() as folder:
-            url = f"{folder}/made.zarr"
-            wanted = [(shard, None) for shard in prepare(url, recipe).shards()]
-            tasks = [(url, recipe, some) for some in batches(recipe, wanted)]
-            began = time.perf_counter()
-            meshes = sum(row.rows for rows in ray_runner(ensure_shards, tasks) for row in rows)
-            rates.append(meshes / (time.perf_counter() - began))
+    recipe, turns = recipe_of(topology, identities), list[tuple[float, float]]()
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    for _ in range(1 + TURNS):
+        with one_cpu_taken():
+            one = on_ray(recipe)
+        turns.append((one, on_ray(recipe)))
     ray.shutdown()
-    return rates[1:]
+    one, two = np.median(turns[1:], axis=0)  # after the first both workers have loaded the body
+    ratios = sorted(two / one for one, two in turns[1:])
+    print(
+        f"\nRay workers, {topology}, medians of {TURNS} turns: one {one:,.0f} meshes/s, two {two:,.0f}, x{two / one:.2f}"
+    )
+    print(
+        f"  in each turn x{ratios[0]:.2f} to x{ratios[-1]:.2f}, x{statistics.median(ratios):.2f} in the median",
+        flush=True,
+    )
+
+
+@contextmanager
+def one_cpu_taken() -> Iterator[None]:
+    """Keep one CPU of the Ray cluster for a task that does nothing."""
+    import ray
+
+    with tempfile.TemporaryDirectory() as folder:
+        begun, end = Path(folder, "begun"), Path(folder, "end")
+        waiting = ray.remote(num_cpus=1)(_wait).remote(begun, end)
+        while not begun.exists():
+            time.sleep(0.02)
+        yield
+        end.touch()
+        ray.get(waiting)
+
+
+def _wait(begun: Path, end: Path) -> None:
+    begun.touch()
+    while not end.exists():
+        time.sleep(0.02)
+
+
+def on_ray(recipe: DatasetRecipe) -> float:
+    """Meshes a second by the workers of the connected Ray cluster that have a CPU to themselves."""
+    with tempfile.TemporaryDirectory() as folder:
+        url = f"{folder}/made.zarr"
+        wanted = [(shard, None) for shard in prepare(url, recipe).shards()]
+        tasks = [(url, recipe, some) for some in batches(recipe, wanted)]
+        meshes = recipe.identities.training * POSES
+        return rate(lambda: list(ray_runner(ensure_shards, tasks)), meshes)
 
 
 def main() -> None:
@@ -215,7 +239,7 @@ def main() -> None:
                 measure(topology, Path(folder))
     memory(topologies[-1])
     for topology in dict.fromkeys([topologies[0], topologies[-1]]):
-        scaling(topology, identities=60 if topology == "anny" else 400)  # of anny 400 would be 5 GB
+        scaling(topology, identities=60 if topology == "anny" else 1200)  # of anny 1200 would be 16 GB
 
 
 if __name__ == "__main__":
