@@ -190,13 +190,9 @@ def scaling(topology: str, identities: int) -> None:
     ray.shutdown()
     one, two = np.median(turns[1:], axis=0)  # after the first both workers have loaded the body
     ratios = sorted(two / one for one, two in turns[1:])
-    print(
-        f"\nRay workers, {topology}, medians of {TURNS} turns: one {one:,.0f} meshes/s, two {two:,.0f}, x{two / one:.2f}"
-    )
-    print(
-        f"  in each turn x{ratios[0]:.2f} to x{ratios[-1]:.2f}, x{statistics.median(ratios):.2f} in the median",
-        flush=True,
-    )
+    middle, least, most = statistics.median(ratios), ratios[0], ratios[-1]
+    print(f"\nRay workers, {topology}, medians of {TURNS} turns: one {one:,.0f} meshes/s, two {two:,.0f}", flush=True)
+    print(f"  x{two / one:.2f}; within a turn x{least:.2f} to x{most:.2f}, x{middle:.2f} in the median", flush=True)
 
 
 @contextmanager

@@ -148,6 +148,14 @@ def _in_glb(file: IO[bytes], size: int) -> int:
     return max((described["accessors"][number]["count"] for number in used if number is not None), default=0)
 
 
+_AS_GLB = "Export it as GLB (in Blender: File > Export > glTF 2.0)"
+_BEGINNINGS = {
+    b"glTF": ".glb", b"ply\n": ".ply", b"ply\r": ".ply", b"OFF\n": ".off", b"OFF\r": ".off",
+    b"Kaydara FBX": "FBX", b"; FBX": "FBX", b"BLENDER": "a Blender file", b"PK\x03\x04": "a ZIP archive",
+    b"\x1f\x8b": "a gzip archive", b"\x89PNG": "a PNG picture", b"\xff\xd8\xff": "a JPEG picture",
+}  # fmt: skip
+"""Of files whose first bytes tell what they are: suffixes of known formats, else what to call it."""
+_HEAD = max(map(len, _BEGINNINGS))
 _COUNTS = {".obj": _in_obj, ".ply": _in_ply, ".off": _in_off, ".stl": _in_stl, ".glb": _in_glb}
 
 
@@ -160,9 +168,20 @@ def require_file(path: Path) -> None:
             raise MeshError(f"{path} is not a regular file")
         raise MeshError(f"no mesh file at {path}{_nearest_beside(path)}")
     if path.suffix.lower() not in FORMATS:
-        raise MeshError(f"{_unknown_format(path)}. Export it as GLB (in Blender: File > Export > glTF 2.0)")
+        raise MeshError(f"{_unknown_format(path)}. {_AS_GLB}")
     if path.stat().st_size == 0:
         raise MeshError(f"{path} is empty (0 bytes): export or copy it again")
+    with path.open("rb") as file:
+        content = _kind_of(file.read(_HEAD))
+    if content in FORMATS and content != path.suffix.lower():
+        raise MeshError(f"{path} is {content[1:].upper()} by its content: name it {path.with_suffix(content).name}")
+    if content not in (*FORMATS, ""):
+        raise MeshError(f"{path} is {content} by its content. {_AS_GLB}")
+
+
+def _kind_of(head: bytes) -> str:
+    """What a file is by its first bytes: a suffix of ours, the name of something else, or nothing that is known."""
+    return next((kind for start, kind in _BEGINNINGS.items() if head.startswith(start)), "")
 
 
 def require_known(path: Path) -> None:

@@ -225,7 +225,8 @@ def part_sizes(mesh: Mesh) -> NDArray[np.int64]:
 def _about_box(name: str, upright: Floats, seen: Seen | None) -> Iterator[str]:
     shape, strays = _proportions(upright), _strays(upright)
     if strays:
-        yield f"{name} has {strays} vertices far from all others, which shrink the body in its box: remove them"
+        far = "1 vertex" if strays == 1 else f"{strays} vertices"
+        yield f"{name} has {far} far from all others, so that the body is small in its box: remove what is there"
     elif shape.min() < _FLAT:
         yield f"{name} is nearly flat (box {_as_text(shape)} of its longest edge): is one of its axes lost?"
     elif seen and _is_beyond(shape, seen):

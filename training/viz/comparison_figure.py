@@ -112,7 +112,7 @@ def _draw_bars(page: Page, columns: Columns, middle: float, row: ShownRow, about
         length, weight = reach * mean / max(about.largest_mean, 1e-12), "bold" if method == best else "normal"
         page.text(start - 10, y, method, size=7, anchor="right", weight=weight, room=start - SIDE - 12)
         page.block(start, y - 0.3 * step, max(length, 1.5), 0.6 * step, colors[method])
-        page.text(start + length + 8, y, f"{mean:.3g}", size=7, weight=weight)
+        page.text(start + length + 8, y, f"{mean:.2f}", size=7, weight=weight)
     page.block(start - 1, top, 1, step * len(row.errors), RULE)
 
 

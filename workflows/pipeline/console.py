@@ -1,6 +1,7 @@
 """How the commands report: text, errors in one line with an exit status; and the MLflow server they mirror to."""
 
 import argparse
+import errno
 import gc
 import io
 import logging
@@ -58,7 +59,8 @@ def guarded(main: Callable[[], None]) -> None:
         _fail(f"{error.object[:300]!r} is not UTF-8 text, which a name must be here. Rename it")
     except OSError as error:
         log.debug("as raised", exc_info=True)
-        _fail(f"{error}. Nothing that was complete is lost; repair this and run again")
+        advice = "choose a shorter one" if error.errno == errno.ENAMETOOLONG else "repair this"
+        _fail(f"{error}. Nothing that was complete is lost; {advice} and run again")
     except Exception as error:
         if not ran_out_of_memory(error):
             raise

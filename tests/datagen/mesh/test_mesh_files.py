@@ -160,6 +160,24 @@ def test_a_hole_of_three_gigabytes_is_refused_at_once(tmp_path: Path) -> None:
         read_mesh_file(tmp_path / "huge.glb")
 
 
+@pytest.mark.parametrize(
+    ("name", "head", "message"),
+    [
+        ("a.obj", b"glTF\2\0\0\0", r"a\.obj is GLB by its content: name it a\.glb"),
+        ("a.stl", b"ply\nformat ascii 1.0\n", r"is PLY by its content: name it a\.ply"),
+        ("a.PLY", b"OFF\n3 1 0\n", r"is OFF by its content: name it a\.off"),
+        ("a.obj", b"Kaydara FBX Binary  \0", r"is FBX by its content\. Export it as GLB"),
+        ("a.glb", b"PK\3\4", r"is a ZIP archive by its content"),
+    ],
+)
+def test_a_file_whose_name_says_another_format_than_its_content(
+    tmp_path: Path, name: str, head: bytes, message: str
+) -> None:
+    (tmp_path / name).write_bytes(head)
+    with pytest.raises(MeshError, match=message):
+        read_mesh_file(tmp_path / name)
+
+
 def test_vertices_that_are_not_the_originals_are_not_written(tmp_path: Path) -> None:
     read = saved(tmp_path, ".obj")
     with pytest.raises(MeshError, match=r"\(4, 3\), the posed ones are \(3, 3\)"):

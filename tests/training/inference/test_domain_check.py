@@ -92,7 +92,7 @@ def test_two_bodies_in_one_file() -> None:
 
 def test_a_stray_vertex_and_a_lost_axis() -> None:
     stray = np.concatenate([GRID, [[0, 90.0, 0]]])
-    assert "A has 1 vertices far from all others" in told(Mesh(stray, STRIP), seen=None)
+    assert "A has 1 vertex far from all others" in told(Mesh(stray, STRIP), seen=None)
     assert "A is nearly flat" in told(Mesh(GRID * (1, 1, 1e-4), STRIP))
 
 

@@ -169,7 +169,7 @@ def _csv_row(sweep: Sweep, result: TrialResult, level: float | None) -> dict[str
         row[f"step_of_best_{pose_type}"] = int(curve.steps[curve.pmd.argmin()]) if len(curve) else ""
     if level is not None:
         step, seconds = result.unseen.first_reached(level) or ("", "")
-        row |= {"level_1": level, "level_1_step": step, "level_1_seconds": seconds}
+        row |= {"twice_the_best": level, "twice_the_best_step": step, "twice_the_best_seconds": seconds}
     return row | {
         "steps": result.steps,
         "seconds": result.seconds,
