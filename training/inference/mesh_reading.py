@@ -134,7 +134,14 @@ def posed_targets(
                 for low_pass, output in zip(through, outputs, strict=True)]  # fmt: skip
         return torch.stack(rows)
 
-    return network.posed_target(stacked(network, vertices), read, surface, heard=heard if any(through) else None)
+    twice = [chosen is not None or has_points(source) for chosen, source in zip(filters, sources, strict=True)]
+    return network.posed_target(
+        stacked(network, vertices),
+        read,
+        surface,
+        heard=heard if any(through) else None,
+        twice=torch.tensor(twice, device=device_of(network)) if any(twice) else None,
+    )
 
 
 def _is_heard(chosen: _Filter | None, source: Mesh, target: Mesh) -> bool:

@@ -1,5 +1,7 @@
 """Meshes as networks read them: without noise along their edges, and points with neighbours of their own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -16,6 +18,7 @@ from training.inference.mesh_reading import (
     transferred,
 )
 from training.networks import parts
+from training.networks.parts import Parts
 from training.recipes.networks import PEOPLE
 
 NO_FACES = np.zeros((0, 3), np.int64)
@@ -56,12 +59,31 @@ def test_what_a_person_is_read_through_the_output_is_read_through(
     def heard(outputs: torch.Tensor) -> torch.Tensor:
         return stacked(network, [LowPass(target.faces, len(target.vertices))(outputs[0].numpy(), 8)])
 
+    twice = torch.tensor([True])
     with torch.no_grad():
-        expected = network.posed_target(filtered, read, surface, heard=heard if both else None)
-        otherwise = network.posed_target(filtered, read, surface, heard=None if both else heard)
+        expected = network.posed_target(filtered, read, surface, heard=heard if both else None, twice=twice)
+        otherwise = network.posed_target(filtered, read, surface, heard=None if both else heard, twice=twice)
     posed = posed_targets(network, [source], [target], read)
     torch.testing.assert_close(posed, expected, rtol=0, atol=1e-5)
     assert surely == 0 or (posed - otherwise).abs().max() > 1e-4
+
+
+def test_points_and_what_is_filtered_are_read_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each by itself: what else is in a batch changes nothing."""
+    network, asked = lively("parts", joints=PEOPLE).eval(), list[list[bool] | None]()
+    real, ball, rough = Parts.posed_target, sphere(subdivisions=3), noisy(sphere(subdivisions=3), 0.03)
+
+    def posed_target(*given: Any, twice: torch.Tensor | None, **named: Any) -> torch.Tensor:
+        asked.append(None if twice is None else twice.tolist())
+        return real(*given, twice=twice, **named)
+
+    monkeypatch.setattr(Parts, "posed_target", posed_target)
+    monkeypatch.setattr(network, "understood", lambda meshes: (torch.tensor([1.0, 0.5]), None))
+    sources = [ball, rough, Mesh(ball.vertices, NO_FACES)]
+    together = transferred(network, sources, [ball] * 3)
+    alone = [transferred(network, [source], [ball])[0] for source in sources]
+    assert asked == [[False, True, True], None, [True], [True]]
+    torch.testing.assert_close(together, torch.stack(alone), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("people", "left", "chosen"), [

@@ -15,14 +15,17 @@ from training.networks.layers import sampling
 from training.networks.layers.rigid_parts import (
     ancestors,
     matrices,
+    mirrored,
     moved_joints,
     nearest_rotations,
+    other_side,
     rotations_from_six,
     turned_about,
 )
 from training.networks.layers.sampling import Sample, Surroundings, others, sample, taken
 from training.networks.layers.surface import Surface
 from training.networks.parts import Parts, Reading, boxed
+from training.recipes.networks import PEOPLE
 
 PARENTS = (-1, 0, 1, 0, 3)
 
@@ -99,6 +102,32 @@ def test_vertices_beyond_the_sample_hear_what_they_would_of_all_of_it(
         torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
     inside = taken(found.logits, drawn.rows)
     torch.testing.assert_close(inside, network.read(drawn).logits, rtol=0, atol=1e-9)
+
+
+def test_parts_know_their_mirror_images_by_name() -> None:
+    found = other_side(["right_hand", "head", "left_hand"])
+    assert found is not None and found.tolist() == [2, 1, 0]
+    assert other_side(["head", "left_hand"]) is None and other_side(["head", "neck"]) is None
+    turn = turned_about(torch.tensor([[0.3, -0.2, 0.5]]))
+    point, image = torch.tensor([1.0, 2, 3]), torch.tensor([-1.0, 2, 3])
+    torch.testing.assert_close(mirrored(turn)[0] @ image, (turn[0] @ point) * torch.tensor([-1.0, 1, 1]))
+
+
+@torch.no_grad()
+def test_what_is_read_twice_is_the_same_of_a_mesh_and_of_its_mirror_image() -> None:
+    network = lively("parts", joints=PEOPLE).eval()
+    assert isinstance(network, Parts) and network.other_side is not None
+    drawn, some = sample(meshes(300, seed=1)), torch.tensor([True, False])
+
+    def image_of(rotations: torch.Tensor) -> torch.Tensor:
+        return mirrored(rotations[:, network.other_side])
+
+    once, twice = network._rotations(drawn, None), network._rotations(drawn, some)
+    of_image = network._rotations(drawn.mirrored(), some)
+    torch.testing.assert_close(image_of(of_image)[0], twice[0], rtol=0, atol=1e-5)
+    assert (image_of(of_image)[1] - twice[1]).abs().max() > 0.1, "else this shows nothing"
+    assert torch.equal(once[1], twice[1])
+    torch.testing.assert_close(torch.linalg.det(twice), torch.ones(twice.shape[:2]))
 
 
 @pytest.mark.parametrize(("surely", "reads"), [(0.0, 3), (1e9, 2)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import torch
@@ -52,6 +53,24 @@ def nearest_rotations(spread: Tensor) -> Tensor:
     flip = torch.linalg.det(left @ right).sign()
     left = left * torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], dim=1)[:, None]
     return left @ right + spread.sum((1, 2), keepdim=True) * 0
+
+
+def other_side(names: Sequence[str]) -> Tensor | None:
+    """Return the number of each part's mirror image [part], as left and right in their names say.
+
+    None where no name says so, or the part on the other side is missing.
+    """
+    opposite = {"left": "right", "right": "left"}
+    images = [re.sub("left|right", lambda side: opposite[side[0]], name) for name in names]
+    if images == list(names) or not set(images) <= set(names):
+        return None
+    return torch.tensor([names.index(image) for image in images])
+
+
+def mirrored(rotations: Tensor) -> Tensor:
+    """Return the mirror images [..., 3, 3] of rotations [..., 3, 3], of left and right, which are along X."""
+    signs = rotations.new_tensor([-1.0, 1.0, 1.0])
+    return signs[:, None] * rotations * signs
 
 
 def skinned(vertices: Tensor, weights: Tensor, turns: Tensor, joints: Tensor, moved: Tensor) -> Tensor:

@@ -99,6 +99,13 @@ class Sample(NamedTuple):
         """Return it where its vertices came to lie [b, k, 3]."""
         return _with_masses(self.rows, vertices, self.masses > 0, self.surface, self.apart)
 
+    def mirrored(self) -> Sample:
+        """Return it of the meshes' mirror images, of left and right, which are along X."""
+        here = self.around
+        signs = here.vertices.new_tensor([-1.0, 1.0, 1.0])
+        around = here._replace(vertices=here.vertices * signs, offsets=here.offsets * signs)
+        return self._replace(around=around)
+
 
 def masses_by(norm_weights: str, vertices: Tensor) -> Tensor | None:
     """Return `vertex_masses` for ``"area"``, None for ``"uniform"``: what a network's norms take."""
