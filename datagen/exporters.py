@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import DatasetError, MeshError, RecipeError, StorageError
-from datagen.common.files import write_atomically
+from datagen.common.files import remove_leftovers, write_atomically
 from datagen.grid import POSE_TYPES
 from datagen.mesh.files import save_mesh
 from datagen.mesh.formats.glb_export import parts_draft
@@ -105,6 +105,7 @@ def export_dataset(
     _require_playable(names, cells)
     try:
         _claim(place, _readme(dataset, names, cells))
+        remove_leftovers(place)
         return _export(dataset, place, names, progress(cells), fresh)
     except (StorageError, PermissionError) as error:
         raise StorageError(

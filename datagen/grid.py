@@ -192,6 +192,11 @@ class Grid:
         lists = [self._triples_of(step, pose_type) for step in range(len(self.steps))]
         return np.concatenate(lists).astype(np.int32)
 
+    def possible_triples(self, pose_type: PoseType) -> int:
+        """How many different evaluation triples of a pose type there are to draw from."""
+        identities = self._identity_count("evaluation")
+        return max(0, identities * (identities - 1) * len(self.poses(pose_type)) * (self.pose_count - 1))
+
     def _triples_of(self, step: int, pose_type: PoseType) -> NDArray[np.int64]:
         added = self.steps[step]
         until = Grid(self.recipe.model_copy(update={"growth": self.recipe.growth[:step]}))

@@ -41,6 +41,10 @@ def found_recipe(layout: Layout, path: str | Path, **options: Any) -> DatasetRec
     BodyError
         See :func:`datagen.bodies.imported_layouts.find_meshes`; or an identity lacks a pose that others have.
     """
+    if not path or not Path(path).is_dir():
+        raise BodyError(
+            f"no folder of meshes at {str(path)!r}. Name it after the layout: dsffnet import {layout} FOLDER"
+        )
     body = ImportedBody.model_validate({"layout": layout, "path": str(Path(path).resolve()), **options})
     meshes = find_meshes(body)
     if layout == "multigarment":

@@ -12,6 +12,7 @@ import errno
 import hashlib
 import logging
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from datagen.common.errors import DamagedFileError, UnsafeFileError, storage_err
 log = logging.getLogger(__name__)
 Value = TypeVar("Value")
 SET_ASIDE = ".unreadable"
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{16}\.partial")
 
 TEXT_LIMIT = 16 * 2**20
 """Bytes of a text or JSON file of ours; the longest that are written have some hundred thousand."""
@@ -224,6 +226,13 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
             temporary.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left of files of :func:`atomic_file` in a folder, at any depth."""
+    for file in files_below(folder):
+        if _LEFTOVER.fullmatch(file.name):
+            os.unlink(file)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

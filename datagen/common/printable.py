@@ -28,5 +28,14 @@ def printable_lines(text: object) -> str:
     return _BUT_LINES.sub(_escape, str(text))
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things in words.
+
+    >>> counted(1, "pose"), counted(1200, "pose")
+    ('1 pose', '1,200 poses')
+    """
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def _escape(found: "re.Match[str]") -> str:
     return found[0].encode("unicode_escape").decode("ascii")

@@ -87,7 +87,7 @@ def generate(
         return open_dataset(url)
     require_memory(recipe)
     check_extent(url, recipe)
-    require_ours(url)
+    require_ours(url, fresh=fresh)
     with writing_alone(url):
         if fresh:
             remove(url)

@@ -1,6 +1,7 @@
 """What a recipe and its assets make of a dataset before its meshes: attributes, small arrays, and where meshes go."""
 
 import importlib.metadata
+import logging
 import uuid
 from collections.abc import Generator, Sequence
 from contextlib import closing
@@ -18,12 +19,13 @@ from datagen.generate.runners import Progress, Runner, Task, closable, inline, u
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays
 from datagen.importers import evaluation_lists, require_files
 from datagen.poses import PoseSource, draw_poses, load_poses
-from datagen.recipe import DatasetRecipe
+from datagen.recipe import DatasetRecipe, ImportedBody
 from datagen.sizes import SECONDS_IDENTITY, SECONDS_POSE
 from datagen.store import Dataset
 from datagen.store.manifest import SoFar
 from datagen.store.writer import Plan, begin, begun
 
+log = logging.getLogger(__name__)
 READS_FOLDERS = ("imported", "mixed")
 """Families whose assets are whole folders: they are hashed once, when a dataset is begun, and not in every worker."""
 _NAMESPACE = uuid.UUID("6f5a4b1e-52f7-5f0b-9a35-2f2a3a7d6c11")
@@ -85,6 +87,7 @@ def plan_of(
         See :func:`head_of`; or there are too few poses.
     """
     grid, head = Grid(recipe), head or head_of("", recipe)
+    _warn_of_few_triples(grid)
     there = (before.grid.identity_count, before.grid.pose_count) if before else (0, 0)
     work = _Work(recipe, run, progress)
     seconds = SECONDS_IDENTITY + recipe.body.seconds_a_mesh
@@ -106,6 +109,21 @@ def plan_of(
         rigs=people.rigs,
         rig_numbers=people.rig_numbers,
     )
+
+
+def _warn_of_few_triples(grid: Grid) -> None:
+    """Say where a list of evaluation triples, of poses that there are, will be empty or repeat itself."""
+    wanted, body = grid.recipe.triples.count, grid.recipe.body
+    possible = {kind: grid.possible_triples(kind) for kind in POSE_TYPES if len(grid.poses(kind))}
+    few = {kind: count for kind, count in possible.items() if count < wanted}
+    identities = len(grid.identities("evaluation"))
+    if few and identities and not (isinstance(body, ImportedBody) and body.test_list):
+        log.warning(
+            "data.triples.count asks for %s evaluation triples, but there are only %s: a triple takes two of the "
+            "evaluation identities (there are %s) and two poses (%s). Set data.identities.evaluation, or a smaller "
+            "data.triples.count", f"{wanted:,}", " and ".join(f"{n:,} of {kind} poses" for kind, n in few.items()),
+            identities, grid.pose_count,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

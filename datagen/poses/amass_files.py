@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from datagen.common.errors import RecipeError, reason_of
 from datagen.common.npz import FAULTS, Header, member_header, opened, read_arrays
+from datagen.common.printable import counted
 
 JOINTS_OF_WIDTH = {66: 22, 72: 24, 156: 22, 165: 22}
 """Numbers in a frame (body alone, SMPL, SMPL-H, SMPL-X) -> how many of its first joints are SMPL's."""
@@ -108,6 +109,7 @@ def read_frames(motion: Motion) -> NDArray[np.float64]:
     wrong = np.flatnonzero(~(np.abs(frames) <= _LARGEST_ANGLE).all(axis=1))
     if len(wrong):
         raise RecipeError(
-            f"{path}: {len(wrong)} frames are not finite, or far from any angle, the first is {wrong[0]}. Take it away"
+            f"{path}: not finite, or far from any angle: {counted(len(wrong), 'frame')}, the first is {wrong[0]}. "
+            "Take it away"
         )
     return frames[:, : 3 * JOINTS_OF_WIDTH[frames.shape[1]]].copy()

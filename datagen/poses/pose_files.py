@@ -11,6 +11,7 @@ from datagen.common.assets import Asset, file_asset
 from datagen.common.errors import RecipeError, reason_of
 from datagen.common.files import write_atomically
 from datagen.common.npz import FAULTS, read_arrays
+from datagen.common.printable import counted
 from datagen.mesh.rig import drivers_of
 from datagen.poses import Poses
 from datagen.poses.skeletons import JOINTS, PARENTS, SMAL_JOINTS, SMAL_PARENTS
@@ -21,6 +22,7 @@ NUMBER = "number"
 
 _LICENCE = "as the file's owner states"
 _LARGEST_ANGLE = 1e6  # radians; sines of numbers far beyond are not finite
+_TWO_TURNS = 4 * np.pi
 _ARRAYS = ("poses", "joints", "parents")
 _MOST_JOINTS = 10_000
 MAKE_ONE = "datagen.poses.pose_files.write_pose_file makes one"
@@ -99,7 +101,7 @@ def read_pose_file(path: str | Path) -> Poses:
         if name not in arrays:
             raise RecipeError(f"{path} has no array {name!r}; it has {', '.join(arrays) or 'none'}. {MAKE_ONE}")
     joints = _names(path, arrays["joints"])
-    return Poses(joints, _parents(path, joints, arrays.get("parents")), _rotations(path, arrays["poses"], len(joints)))
+    return Poses(joints, _parents(path, joints, arrays.get("parents")), _rotations(path, arrays["poses"], joints))
 
 
 def write_pose_file(path: str | Path, poses: Poses) -> None:
@@ -120,18 +122,25 @@ def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
         raise RecipeError(f"{path} is no .npz file of plain arrays ({reason_of(error)}). {MAKE_ONE}") from error
 
 
-def _rotations(path: str | Path, poses: NDArray[np.generic], joints: int) -> NDArray[np.float64]:
-    if poses.ndim != 3 or poses.shape[1:] != (joints, 3) or poses.dtype.kind not in "fiu":
+def _rotations(path: str | Path, poses: NDArray[np.generic], joints: Sequence[str]) -> NDArray[np.float64]:
+    if poses.ndim != 3 or poses.shape[1:] != (len(joints), 3) or poses.dtype.kind not in "fiu":
         raise RecipeError(
-            f"{path}: `poses` has shape {poses.shape} and type {poses.dtype}; with {joints} joints it must be numbers "
-            f"[pose, {joints}, 3]. {MAKE_ONE}"
+            f"{path}: `poses` has shape {poses.shape} and type {poses.dtype}; with {counted(len(joints), 'joint')} it "
+            f"must be numbers [pose, {len(joints)}, 3]. {MAKE_ONE}"
         )
     rotations = poses.astype(np.float64)
     wrong = np.flatnonzero(~(np.abs(rotations) <= _LARGEST_ANGLE).all(axis=(1, 2)))
     if len(wrong):
         raise RecipeError(
-            f"{path}: {len(wrong)} poses are not finite, or far from any angle in radians, the first is number "
+            f"{path}: not finite, or far from any angle in radians: {counted(len(wrong), 'pose')}, the first is number "
             f"{wrong[0]}. Leave them out"
+        )
+    lengths = np.linalg.norm(rotations, axis=2)
+    if lengths.size and lengths.max() > _TWO_TURNS:
+        pose, joint = np.argwhere(lengths > _TWO_TURNS)[0].tolist()
+        raise RecipeError(
+            f"{path}: pose {pose} turns joint {joint} ({joints[joint]!r}) by {lengths[pose, joint]:.4g}, more than two "
+            "turns (12.57): are these degrees? they must be radians. Convert them: numpy.radians(poses)"
         )
     return rotations
 

@@ -23,6 +23,7 @@ from datagen.recipe.dataset import (
     IdentityRecipe,
     PoseRecipe,
     StoreRecipe,
+    plain_sha256,
 )
 from datagen.recipe.poses import AmassPoses, ClipPoses, Distribution, FilePoses, FoundPoses, NptPoses, RangePoses
 
@@ -64,4 +65,5 @@ __all__ = [
     "SmalBody",
     "SmplBody",
     "StoreRecipe",
+    "plain_sha256",
 ]

@@ -1,6 +1,6 @@
 """What every section of a recipe is made of."""
 
-from typing import Self
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
@@ -13,6 +13,16 @@ class Frozen(BaseModel):
     """Base of every recipe section: immutable, unknown keys are errors, defaults are validated too."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, values: Any) -> Any:
+        for name, field in cls.model_fields.items() if isinstance(values, dict) else ():
+            value = values.get(name)
+            entries = value if isinstance(value, list | tuple) else [value]
+            if field.annotation is not bool and any(isinstance(entry, bool) for entry in entries):
+                raise ValueError(f"{name}: true and false are no values of this key")
+        return values
 
     @model_validator(mode="after")
     def _whole_numbers_can_be_counted_with(self) -> Self:

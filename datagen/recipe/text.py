@@ -182,6 +182,8 @@ def _parse_word(word: str, option: str) -> tuple[str, Any]:
     key, equals, text = word.partition("=")
     if not equals or not all(key.split(".")):
         raise RecipeError(f"{option}{shown(word)} is not of the form section.key=value, e.g. training.steps=100")
+    if not text.strip():
+        raise RecipeError(f"{option}{shown(word)} has no value after =; write {key}=null where it is to have none")
     where = option.strip() or "override"
     require_plain({key: text}, where=where)
     try:

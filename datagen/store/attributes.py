@@ -129,12 +129,17 @@ def check_same_recipe(url: str, group: zarr.Group, recipe: DatasetRecipe) -> Non
     stored = stored_recipe(url, group)
     changed = ", ".join(_differences(stored.identifying(), recipe.identifying()))
     if not changed:
-        raise DatasetError(
-            f"{url}: the recipe in its attributes is not the one that it was made by. Run the command that made it "
-            "again, with that recipe, and it is repaired"
-        )
+        raise changed_recipe(url)
     raise DatasetError(
         f"{url} was made by another recipe ({changed}). Write to another place, or add --fresh to make it anew"
+    )
+
+
+def changed_recipe(url: str) -> DatasetError:
+    """The error of a dataset whose recipe is not the one that its hash is of."""
+    return DatasetError(
+        f"{url}: the recipe in its attributes is not the one that it was made by. Run the command that made it again, "
+        "with that recipe, and it is repaired"
     )
 
 

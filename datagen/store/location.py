@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 from datagen.common.errors import DatasetError, NoDataset
 from datagen.store.object_names import MEMBERS
 from datagen.store.objects import LocalObjects, delete_object, is_local, list_objects, plain
-from datagen.store.schema import check_ours, check_version, open_group
+from datagen.store.schema import check_ours, check_version, lost_root, open_group
 
 _FOLDERS = (*MEMBERS, "identity")
 """What a dataset's root holds, the last one in format 2."""
@@ -25,7 +25,7 @@ def remove(url: str) -> None:
     DatasetError
         The place holds something that is not a dataset.
     """
-    require_ours(url)
+    require_ours(url, fresh=True)
     if not is_local(url):
         _remove_remote(url)
         return
@@ -49,13 +49,13 @@ def _remove_remote(url: str) -> None:
         delete_object(group, path)
 
 
-def require_ours(url: str) -> None:
-    """Refuse a place that holds anything but a dataset of ours.
+def require_ours(url: str, *, fresh: bool = False) -> None:
+    """Refuse a place that holds anything but a dataset of ours, which can be ``fresh`` made without its zarr.json.
 
     Raises
     ------
     DatasetError
-        It is a file, somebody else's Zarr group, or a folder with other things in it.
+        It is a file, somebody else's Zarr group, a folder with other things in it, or a dataset that lost its root.
     """
     if not is_local(url):
         with contextlib.suppress(NoDataset):
@@ -66,6 +66,10 @@ def require_ours(url: str) -> None:
         raise DatasetError(f"{url} is a file, not a dataset. Choose another --out")
     there = sorted(entry.name for entry in path.iterdir()) if path.exists() else []
     if there and not _has_our_root(path):
+        if LocalObjects(os.path.realpath(path)).has_lost_root():
+            if fresh:
+                return
+            raise DatasetError(lost_root(url))
         raise DatasetError(f"{url} holds what is not a dataset ({there[0]}). Choose another --out")
     strangers = [name for name in there if not name.startswith(".") and name not in (*_FOLDERS, "zarr.json")]
     if strangers:

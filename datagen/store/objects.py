@@ -5,6 +5,7 @@ touch objects of the layout only, read no more of one than it can have, follow n
 regular files only.
 """
 
+import json
 import os
 import stat
 from collections.abc import AsyncIterator, Iterable, Iterator
@@ -67,6 +68,16 @@ class LocalObjects(LocalStore):
     def names(self) -> list[str]:
         """Names of what lies directly in the folder."""
         return sorted(os.listdir(self.root)) if self.root.is_dir() else []
+
+    def has_lost_root(self) -> bool:
+        """Whether the folder holds a dataset, and nothing else, whose zarr.json is missing or no JSON."""
+        paths = [path for path in self.paths() if not path.startswith(".")]
+        if "manifest/zarr.json" not in paths or not all(is_member(path) or is_leftover(path) for path in paths):
+            return False
+        try:
+            return not isinstance(json.loads(self.read("zarr.json") or b""), dict)
+        except (ValueError, RecursionError):
+            return True
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
         for path in self.paths(prefix):  # Zarr's own way takes several times as long

@@ -32,7 +32,7 @@ from datagen.mesh.rig import Rigs
 from datagen.recipe import DatasetRecipe
 from datagen.store.arrays import ArrayDamage, read_array
 from datagen.store.codec import LARGEST_CHUNK, ShardCodec
-from datagen.store.objects import Objects, open_objects
+from datagen.store.objects import LocalObjects, Objects, open_objects
 
 FORMAT_VERSION = 4
 OLDEST_RECIPE = 2
@@ -206,7 +206,7 @@ def open_group(url: str, *, mode: Literal["r", "r+"] = "r") -> zarr.Group:
                 return _group_of(store, mode)
             except Exception as again:
                 raise _unreadable(url, again) from again
-        raise NoDataset(f"no dataset at {url}. Make one: dsffnet generate --recipe quickstart --out {url}") from error
+        raise NoDataset(_what_is_there(url, store)) from error
     except ImportError as error:
         raise DatasetError(f"{url} needs a package that is not installed ({error}). Install it with pip") from error
     except Exception as error:  # whatever Zarr comes to on metadata that is none
@@ -217,6 +217,28 @@ def _group_of(store: Objects, mode: Literal["r", "r+"]) -> zarr.Group:
     group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
     attributes_of(group)
     return group
+
+
+def _what_is_there(url: str, store: Objects) -> str:
+    """Why there is no dataset in a place without a zarr.json, and what to do."""
+    make = "dsffnet generate --recipe quickstart --out"
+    if not isinstance(store, LocalObjects):
+        return f"no dataset at {url}. Make one: {make} {url}"
+    if store.root.exists() and not store.root.is_dir():
+        return f"no dataset at {url}, which is a file. Name a dataset's folder, or make one: {make} NEW.zarr"
+    if store.has_lost_root():
+        return lost_root(url)
+    if names := [name for name in store.names() if not name.startswith(".")]:
+        return f"no dataset at {url}, which holds {names[0]!r}. Name a dataset's folder, or make one: {make} NEW.zarr"
+    return f"no dataset at {url}. Make one: {make} {url}"
+
+
+def lost_root(url: str) -> str:
+    """What is wrong with a dataset without a zarr.json that can be read, and what to do."""
+    return (
+        f"{url} has lost its zarr.json, which is missing or cannot be read while the rest of a dataset is there. Make "
+        f"it again: dsffnet generate --recipe RECIPE --out {url} --fresh"
+    )
 
 
 def _unreadable(url: str, error: Exception) -> DatasetError:

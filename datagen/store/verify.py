@@ -9,11 +9,12 @@ import numpy as np
 import zarr
 
 from datagen.common.errors import DatasetError, UnsafeFileError, reason_of
+from datagen.common.printable import counted
 from datagen.grid import POSE_TYPES, SPLITS, Grid, GridArrays, Shard, shard_path
 from datagen.mesh.parts import part_name
-from datagen.recipe import DatasetRecipe, MixedBody
+from datagen.recipe import DatasetRecipe, MixedBody, plain_sha256
 from datagen.store.arrays import ArrayDamage, read_array
-from datagen.store.attributes import attributes_fault
+from datagen.store.attributes import attributes_fault, changed_recipe
 from datagen.store.manifest import (
     Manifest,
     ManifestRow,
@@ -27,7 +28,7 @@ from datagen.store.manifest import (
 )
 from datagen.store.objects import read_bytes, stored_sizes
 from datagen.store.reader import Dataset, damage_of
-from datagen.store.schema import OLDEST_RECIPE, attributes_of, check_version, open_group, stored_recipe
+from datagen.store.schema import FORMAT_VERSION, OLDEST_RECIPE, attributes_of, check_version, open_group, stored_recipe
 from datagen.store.writer import decoded, existing_shard
 
 
@@ -154,7 +155,7 @@ def describe(url: str, *, written: Mapping[str, int] | None = None) -> dict[str,
         "body": f"{recipe.body.family} {_kind(recipe)}".strip(),
         "identities": ", ".join(f"{_count(grid.identities(split))} {split}" for split in SPLITS),
         "poses": f"{len(grid.poses('seen'))} seen, {len(grid.poses('unseen'))} unseen "
-        f"({recipe.poses.distribution.name}, {len(attributes['joints'])} joints)",
+        f"({recipe.poses.distribution.name}, {counted(len(attributes['joints']), 'joint')})",
         "rig": _rigs(attributes["rigs"]),
         "clothes": _clothes(dataset, arrays),
         "appended": _growth(recipe),
@@ -266,8 +267,16 @@ def require_recipe(url: str) -> DatasetRecipe:
     Raises
     ------
     DatasetError
-        There is none that can be read.
+        There is none that can be read, or it is not as it was written.
     """
     group = open_group(url)
     check_version(url, group, oldest=OLDEST_RECIPE)
-    return stored_recipe(url, group)
+    recipe, attributes = stored_recipe(url, group), attributes_of(group)
+    if attributes.get("recipe_sha256") != plain_sha256(attributes["recipe"]):
+        raise changed_recipe(url)
+    complete = attributes["format_version"] == FORMAT_VERSION and attributes.get("status") == "complete"
+    if complete and not is_sealed(group):
+        raise DatasetError(
+            f"{url}: its attributes (zarr.json) are not as they were written. Repair it: dsffnet verify {url} --repair"
+        )
+    return recipe

@@ -75,6 +75,19 @@ def test_an_export_goes_on_where_it_stopped(dataset: str, tmp_path: Path) -> Non
     assert tree_hash(parts) == tree_hash(whole)
 
 
+def test_what_a_killed_export_left_is_removed_by_the_next(dataset: str, tmp_path: Path) -> None:
+    data, kept = open_dataset(dataset), tmp_path / ".mine.partial"
+    export_dataset(data, tmp_path, layout="glb", identities=[0], poses=[0])
+    left = [
+        tmp_path / ".README.txt.0123456789abcdef.partial",
+        tmp_path / "identity-0000" / ".a.glb.0123456789abcdef.partial",
+    ]
+    for path in (kept, *left):
+        path.touch()
+    export_dataset(data, tmp_path, layout="glb", identities=[0], poses=[0])
+    assert kept.exists() and not any(path.exists() for path in left)
+
+
 def test_lists_name_files_that_are_there_alone(dataset: str, tmp_path: Path) -> None:
     data = open_dataset(dataset)
     export_dataset(data, tmp_path, layout="npt-ply", identities=[3, 4], poses=range(5))

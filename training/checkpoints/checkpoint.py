@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from datagen.common.errors import CheckpointError, DamagedFileError
-from datagen.common.files import resolve_within, write_atomically
+from datagen.common.files import resolve_within, warn_once, write_atomically
 from training.checkpoints.folder import (
     AVERAGE,
     BEST,
@@ -156,6 +156,10 @@ def load_checkpoint(run: Path, which: Which = "latest", *, weights_only: bool = 
             return newest
         return load_checkpoint(run, "best", weights_only=weights_only) or newest
     path = best_of(run) if which == "best" else step_folder(run, f"step-{which:08d}")
+    if isinstance(which, int) and path and not path.exists():
+        steps = [each.name.removeprefix("step-").lstrip("0") for each in newest_first(run)]
+        there = ", ".join(steps[::-1]) or "there is none"
+        raise CheckpointError(f"checkpoint {path} is not there. Name another step: {there}")
     return _named(path, weights_only=weights_only) if path else None
 
 
@@ -172,6 +176,11 @@ def require_checkpoint(run: Path, which: Which = "latest", *, weights_only: bool
     checkpoint = load_checkpoint(folder, which, weights_only=weights_only)
     if checkpoint is None and which == "best":
         raise CheckpointError(f"{run} has no best checkpoint: none was measured on unseen poses. Take the newest one")
+    if checkpoint is None and (count := len(list(newest_first(folder)))):
+        raise CheckpointError(
+            f"{run} has no sound checkpoint: {count} of {count} are damaged. Copy one back, or repeat the command that "
+            "trained it, which starts again from step 0"
+        )
     if checkpoint is None:
         raise CheckpointError(f"{run} has no usable checkpoint. Name the folder of a training that has written one")
     return checkpoint
@@ -232,7 +241,7 @@ def _newest_sound(run: Path, *, weights_only: bool) -> Checkpoint | None:
         fault = fault_of(path, weights_only=weights_only)
         if fault is None:
             return read_checkpoint(path)
-        log.warning("checkpoint %s is damaged (%s); falling back to the one before it", path, fault)
+        warn_once(f"checkpoint {path} is damaged ({fault}) and passed over")
     return None
 
 

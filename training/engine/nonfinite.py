@@ -12,6 +12,7 @@ import torch
 
 from datagen.common.errors import StorageError, TrainingError
 from datagen.common.files import write_atomically
+from training.checkpoints.folder import newest_first
 from training.engine.distributed import Ranks, gathered
 
 log = logging.getLogger(__name__)
@@ -60,11 +61,12 @@ def stop_for(mine: Broken, run: Path, ranks: Ranks) -> None:
     kept = _written(run, step, culprits) if ranks.rank == 0 else f" (see {run / NOT_FINITE})"
     here = mine in culprits
     where = f"this rank's examples were {mine.examples}" if here else "on another rank"
+    earlier = "The last good checkpoint is kept" if any(newest_first(run)) else "There is no checkpoint yet"
     if culprits[0].what == "gradient":
         where = f"in the gradient only; {where}"
     raise TrainingError(
         f"loss or gradient is not finite at step {step} ({where}). Nothing was learned from it{kept}. "
-        "The last good checkpoint is kept; lower training.learning_rate or set training.gradient_clip",
+        f"{earlier}; lower training.learning_rate or set training.gradient_clip",
         secondary=mine.rank != culprits[0].rank,
     )
 

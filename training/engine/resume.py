@@ -8,7 +8,9 @@ from pathlib import Path
 import torch
 
 from datagen.common.errors import CheckpointError, reason_of
+from datagen.common.files import warn_once
 from training.checkpoints.checkpoint import Checkpoint, load_checkpoint, read_checkpoint, recipe_of, require_checkpoint
+from training.checkpoints.folder import newest_first
 from training.checkpoints.state_file import unusable_state
 from training.engine.distributed import Ranks, agreed, decided_by_first, restore_random_state
 from training.engine.state import Job, State, Verdict
@@ -55,7 +57,7 @@ def checkpoint_to_resume(job: Job) -> Checkpoint | None:
     """
 
     def newest() -> str | None:
-        checkpoint = load_checkpoint(job.run)
+        checkpoint = newest_of(job.run)
         return str(checkpoint.path) if checkpoint else None
 
     path = decided_by_first(job.ranks, newest)
@@ -68,6 +70,14 @@ def checkpoint_to_resume(job: Job) -> Checkpoint | None:
         return checkpoint
 
     return agreed(job.ranks, read, what="resume from the newest checkpoint")
+
+
+def newest_of(run: Path) -> Checkpoint | None:
+    """Return the newest sound checkpoint of a run; None, with a warning where others are left, where it has none."""
+    found = load_checkpoint(run)
+    if found is None and any(newest_first(run)):
+        warn_once(f"no sound checkpoint is left in {run}: training starts again from step 0")
+    return found
 
 
 def weights_to_begin_from(recipe: TrainingRecipe, ranks: Ranks) -> Checkpoint | None:

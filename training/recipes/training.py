@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from datagen.common.errors import RecipeError
 from datagen.recipe import Frozen
@@ -39,8 +39,8 @@ def budget_seconds(budget: str) -> float:
     return float(found[1]) * _SECONDS[found[2]]
 
 
-def _is_time(budget: str) -> str:
-    budget_seconds(budget)
+def _is_time(budget: object) -> object:
+    budget_seconds(str(budget))
     return budget
 
 
@@ -58,8 +58,8 @@ def block_bytes(block: str) -> int:
     return int(float(found[1]) * _BYTES[found[2]])
 
 
-def _is_size(block: str) -> str:
-    block_bytes(block)
+def _is_size(block: object) -> object:
+    block_bytes(str(block))
     return block
 
 
@@ -175,7 +175,7 @@ class TrainingRecipe(Frozen):
     accumulate: int = Field(1, ge=1, description="parts that a rank's share of a batch is cut into, to save memory")
     epochs: int = Field(200, ge=1, description="epochs; one epoch is identities x poses triples")
     steps: int | None = Field(None, ge=1, description="stop after this many steps instead; the schedule spans them")
-    budget: Annotated[str, AfterValidator(_is_time)] | None = Field(
+    budget: Annotated[str, BeforeValidator(_is_time)] | None = Field(
         None, description="time after which one command stops with a checkpoint, e.g. 10min; run it again to resume"
     )
     optimiser: Literal["adamw", "adam", "muon"] = Field(
@@ -223,7 +223,7 @@ class TrainingRecipe(Frozen):
         description="where decoded meshes are kept: device: all in the memory of the device that trains; stream: as "
         "many as memory has room for; auto: device where they fit",
     )
-    block: Annotated[str, AfterValidator(_is_size)] | None = Field(
+    block: Annotated[str, BeforeValidator(_is_size)] | None = Field(
         None,
         description="for data larger than memory: triples come in blocks of shards that take so much memory, all ranks "
         "together (of each rank, where a block is too small to share), e.g. 16GB, and each shard is read about once an "

@@ -26,7 +26,7 @@ def draw_contact_sheet(dataset: Dataset, path: Path) -> Path:
     rows, columns = chosen(identity_groups(grid), _ROWS), chosen(pose_groups(grid), _COLUMNS)
     before = grid.steps[0].training + grid.steps[0].evaluation, grid.steps[0].seen + grid.steps[0].unseen
     headings = [f"pose {p}\n{grid.pose_type(p)}{_appended(p, before[1])}" for p in columns]
-    labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}".replace(", ", ",\n") for i in rows]
+    labels = [f"identity {i}\n{grid.split(i)}{_appended(i, before[0])}" for i in rows]
     title = f"{len(rows)} of {grid.identity_count:,} identities in {len(columns)} of {grid.pose_count:,} poses"
     hues = _HUES[: len(rows)]
     page = [Row(label, _panels(dataset, i, columns, hue)) for label, i, hue in zip(labels, rows, hues, strict=True)]
@@ -80,4 +80,4 @@ def _panels(dataset: Dataset, identity: int, poses: list[int], hue: str) -> list
 
 
 def _appended(number: int, before: int) -> str:
-    return ", appended" if number >= before else ""
+    return ",\nappended" if number >= before else ""

@@ -12,6 +12,7 @@ import logging
 import os
 import re
 import shlex
+import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ def publish(root: Path, server: Server) -> None:
     for chatty in ("mlflow", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # raised, too
+    logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)  # each retry would be a line
     failures: list[Exception] = []
     try:
         prepare_store(server)
@@ -66,15 +68,33 @@ def publish(root: Path, server: Server) -> None:
         failures.append(error)
     if failures:
         log.debug("publishing %s failed", root, exc_info=failures[0])
-        reason = str(failures[0]) if isinstance(failures[0], DsffnetError) else _first_line(failures[0])
         later = f". Nothing is lost: {_how_to_sync(root, server)} sends what is missing"
         raise TrackingError(
-            f"MLflow at {server.uri} could not be brought up to date ({reason})"
+            f"MLflow at {server.uri} could not be brought up to date ({_reason(failures[0])})"
             f"{'' if isinstance(failures[0], UnsafeFileError) else later}"
         ) from failures[0]
 
 
-def _first_line(error: Exception) -> str:
+def _reason(error: BaseException | None) -> str:
+    """What failed, in few words: below MLflow's, requests' and urllib3's errors of a connection lies the system's."""
+    if isinstance(error, DsffnetError):
+        return str(error)
+    cause = error
+    while cause:
+        if words := _NO_CONNECTION.get(type(cause)):
+            return words
+        cause = cause.__cause__ or cause.__context__
+    return _first_line(error) if error else ""
+
+
+_NO_CONNECTION: dict[type[BaseException], str] = {
+    socket.gaierror: "the host cannot be found",
+    ConnectionRefusedError: "it refuses connections",
+    TimeoutError: "it does not answer",
+}
+
+
+def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
@@ -330,18 +350,24 @@ class Mirror:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Publish once more; where that fails, raise its TrackingError, unless the block has failed already."""
+        """Publish once more; where that fails, raise its TrackingError, or warn where the block has failed already."""
         if not self._on:
             return
         self._background.__exit__(None, None, None)
         self._publish()
         if self._failed and kind is None:
             raise self._failed
+        if self._failed:
+            log.warning("%s", self._failed)
 
     def _follow(self, stop: threading.Event) -> None:
         pause = 0.1
         while not stop.wait(pause):
+            was_well = self._failed is None
             self._publish()
+            if self._failed and was_well:
+                reason = _reason(self._failed.__cause__)
+                log.warning("MLflow at %s gets nothing now (%s); the work goes on", self._server.uri, reason)
             pause = self._every if self._failed is None else self._after_failure
 
     def _publish(self) -> None:
@@ -351,6 +377,4 @@ class Mirror:
                 log.warning("MLflow at %s is back and has been sent what it missed", self._server.uri)
             self._failed = None
         except TrackingError as error:
-            if self._failed is None:
-                log.warning("%s", error)
             self._failed = error

@@ -31,8 +31,8 @@ def comparison_figure(
 
     The panels of a row share one camera; the source is drawn at the truth's size. Errors have one scale of colours in
     the whole figure: below each output or, of a single method, in a last column. Of several methods, bars compare the
-    mean errors of a row, the words under the one with the least PMD are bold, and outputs and truth are shown near by
-    too, where the methods differ most. Without a truth there are no errors.
+    mean errors of a row, the least in bold; the words under the one with the least PMD are bold, and outputs and truth
+    are shown near by too, where the methods differ most. Without a truth there are no errors.
 
     Parameters
     ----------
@@ -103,13 +103,13 @@ def _draw_row(page: Page, columns: Columns, top: int, row: ShownRow, strips: Seq
 
 def _draw_bars(page: Page, columns: Columns, middle: float, row: ShownRow, about: _Errors) -> None:
     """Draw the mean error of each method as a bar beside the heat maps; bars have one scale in the whole figure."""
-    colors, best = method_colors(columns.methods), best_of(row.errors)
+    colors, least = method_colors(columns.methods), min(float(errors.mean()) for errors in row.errors.values())
     start, reach, step = SIDE + 0.78 * columns.panel[0], 0.9 * columns.panel[0], 42.0
     top = middle - step * len(row.errors) / 2 + 14
     page.text(start, top - 20, f"mean error of a vertex ({ERROR_UNIT})", size=6.5, color=QUIET)
     for place, (method, errors) in enumerate(row.errors.items()):
         mean, y = float(errors.mean()), top + (place + 0.5) * step
-        length, weight = reach * mean / max(about.largest_mean, 1e-12), "bold" if method == best else "normal"
+        length, weight = reach * mean / max(about.largest_mean, 1e-12), "bold" if mean == least else "normal"
         page.text(start - 10, y, method, size=7, anchor="right", weight=weight, room=start - SIDE - 12)
         page.block(start, y - 0.3 * step, max(length, 1.5), 0.6 * step, colors[method])
         page.text(start + length + 8, y, f"{mean:.2f}", size=7, weight=weight)

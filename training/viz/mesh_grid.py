@@ -70,11 +70,14 @@ def mesh_grid(
         raise ValueError(f"need rows of at most {len(columns)} panels, got {[len(row.panels) for row in rows]}")
     width = _LABELS + len(columns) * size[0] + _EDGE
     lines = textwrap.wrap(title, int((width - 2 * _EDGE) / _LETTER))
-    header = 10 + len(lines) * _LINE + _HEADINGS
+    more = _CAPTION * (max([1, *(heading.count("\n") for heading in columns)]) - 1)  # than two lines
+    header = 10 + len(lines) * _LINE + _HEADINGS + more
     page = Page(width=width, height=header + len(rows) * (size[1] + _CAPTION) + _EDGE)
     page.text(_EDGE, 10, "\n".join(lines), size=8, va="top", linespacing=1.35)
     for place, heading in enumerate(columns):
-        page.text(_LABELS + (place + 0.5) * size[0], header - 30, heading, size=7.5, anchor="center", weight="bold")
+        page.text(
+            _LABELS + (place + 0.5) * size[0], header - 30 - more / 2, heading, size=7.5, anchor="center", weight="bold"
+        )
     whole = _camera(rows, size) if one_scale else None
     for number, row in enumerate(rows):
         top = header + number * (size[1] + _CAPTION)

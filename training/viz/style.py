@@ -15,7 +15,7 @@ from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from datagen.common.arrays import Floats
 from datagen.common.printable import printable_lines
@@ -104,12 +104,13 @@ def logarithmic(axis: Axis, places: Sequence[float]) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def style_learning(axes: Axes) -> None:
-    """PMD on a logarithmic scale over steps or seconds from 0."""
+def style_learning(axes: Axes, *, steps: bool) -> None:
+    """PMD on a logarithmic scale over ``steps``, numbered where they are whole, or seconds, from 0."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     logarithmic(axes.yaxis, range(1, 10) if high / low < 8 else (1, 2, 5) if high / low < 1000 else (1,))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    axes.xaxis.set_major_locator(MaxNLocator("auto", integer=steps))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
     axes.set_xlim(left=0)
     axes.margins(x=0.01)
     style_axes(axes)

@@ -127,5 +127,5 @@ def load_avatar(
     if isinstance(values.get("people"), list):
         folder = Path.cwd() if people else path.resolve().parent
         values["people"] = [require_reachable(str(folder / str(its)), option="--people") for its in values["people"]]
-    with recipe_faults(name_or_file, keys="dsffnet avatar train --help-all"):
+    with recipe_faults(name_or_file, model=AvatarWorkflow, keys="dsffnet avatar train --help-all"):
         return AvatarWorkflow.model_validate(values)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from datagen.common.errors import DatasetError, RecipeError
-from datagen.common.printable import printable
+from datagen.common.printable import counted, printable
 from workflows.cli.declare import (
     Command,
     Parser,
@@ -17,7 +17,7 @@ from workflows.cli.declare import (
     add_set_option,
     add_yes_option,
 )
-from workflows.pipeline.console import print_facts, print_text
+from workflows.pipeline.console import print_facts, print_text, warn
 
 if TYPE_CHECKING:
     from datagen.recipe import DatasetRecipe
@@ -96,9 +96,8 @@ def declare_stand_in(made: Parser) -> None:
     made.add_argument("--out", required=True, metavar="X.npz", help="where it goes; of animals a folder")
     made.add_argument(
         "--topology",
-        default="notoes_collapse10pc",
         choices=get_args(AnnyTopology),
-        help="of the Anny body it is made from",
+        help="of people: of the Anny body it is made from (notoes_collapse10pc)",
     )
 
 
@@ -142,6 +141,8 @@ def append_command(options: argparse.Namespace) -> None:
     grown = grown_recipe(options.out, recipe, totals)
     with _runner(options, grown, anew=grown != recipe) as how:
         made = append(options.out, **totals, recipe=recipe, **how)
+    if grown == recipe:
+        print_text(f"nothing was to be appended: {options.out} has these totals already")
     _show(made)
 
 
@@ -155,12 +156,31 @@ def inspect_command(options: argparse.Namespace) -> None:
     from datagen.store import open_dataset
     from datagen.store.verify import describe
     from training.reports.contact_sheet import draw_contact_sheet
-    from workflows.pipeline.generate import is_complete
 
+    place = _picture_of(options.dataset, options.picture) if options.picture else _beside(options.dataset)
     print_facts(describe(options.dataset))
-    if options.picture != "none" and is_complete(options.dataset):
-        place = Path(options.picture) if options.picture else _beside(options.dataset)
+    if options.picture == "none":
+        return
+    try:
         print_text(f"picture: {draw_contact_sheet(open_dataset(options.dataset), place)}")
+    except DatasetError as error:
+        if options.picture:
+            raise DatasetError(f"no picture was made: {error}") from error
+        warn(f"no picture was made: {error}")
+
+
+def _picture_of(dataset: str, name: str) -> Path:
+    """Where the picture goes that was asked for; what is no picture, or part of the dataset, is not written over."""
+    from datagen.store.objects import plain
+
+    place, within = Path(name), os.path.realpath(plain(dataset))
+    if name != "none" and (
+        place.suffix.lower() != ".png" or place.is_dir() or Path(os.path.realpath(place)).is_relative_to(within)
+    ):
+        raise RecipeError(
+            f"--picture {name!r}: a picture is a file that ends in .png and lies outside the dataset, e.g. sheet.png"
+        )
+    return place
 
 
 def _beside(dataset: str) -> Path:
@@ -196,7 +216,7 @@ def verify_command(options: argparse.Namespace) -> None:
         print_text(f"{options.dataset} is whole")
         return
     if not options.repair:
-        found = f"has {len(faults)} faults" if faults else "is not complete"
+        found = f"has {counted(len(faults), 'fault')}" if faults else "is not complete"
         raise DatasetError(f"{options.dataset} {found}. Repair it: dsffnet verify {options.dataset} --repair")
     repair(options.dataset, recipe, faults, run=inline, progress=generation_bar)
     print_text(f"{options.dataset} is whole again")
@@ -211,12 +231,12 @@ def _own_recipe(url: str, overrides: Sequence[str]) -> "DatasetRecipe":
         Something else than a path is changed.
     """
     from datagen.recipe import PATH_KEYS
-    from datagen.store.schema import check_version, open_group
-    from datagen.store.verify import require_recipe
+    from datagen.store.schema import check_version, open_group, stored_recipe
     from workflows.recipe.loader import change_recipe
 
-    check_version(url, open_group(url))
-    stored = require_recipe(url)
+    group = open_group(url)
+    check_version(url, group)
+    stored = stored_recipe(url, group)
     recipe = change_recipe({"data": stored.model_dump(mode="json")}, overrides, where=url).data
     if recipe.sha256() != stored.sha256():
         raise RecipeError(f"--set can only change where the asset files of {url} lie: {', '.join(sorted(PATH_KEYS))}")
@@ -281,7 +301,7 @@ def export_command(options: argparse.Namespace) -> None:
         fresh=options.fresh,
         progress=lambda cells: bar(cells, total=len(cells), what="export", unit="mesh"),
     )
-    print_text(f"{options.out}: {written} files written")
+    print_text(f"{options.out}: {counted(written, 'file')} written")
 
 
 def convert_body_command(options: argparse.Namespace) -> None:
@@ -303,12 +323,17 @@ def stand_in_command(options: argparse.Namespace) -> None:
       dsffnet generate --recipe smpl-paper --set data.body.path=standin.npz --out data/standin.zarr
       dsffnet stand-in animals --out animals
     """
+    if options.topology and options.kind in ("smal", "animals"):
+        raise RecipeError(
+            f"--topology {options.topology} is of people, which {options.kind} is not made from. Leave it out"
+        )
     if options.kind == "animals":
         _write_animals(Path(options.out))
         return
     from datagen.bodies.standins.smpl_format import write_standin
 
-    path = write_standin(options.kind, Path(options.out), topology=options.topology)
+    of_people = {"topology": options.topology} if options.topology else {}
+    path = write_standin(options.kind, Path(options.out), **of_people)
     family = "smal" if options.kind == "smal" else f"smpl data.body.model={options.kind}"
     print_text(
         f"written: {path}. It is not the licensed model. Use it: --set data.body.family={family} data.body.path={path}"

@@ -19,7 +19,7 @@ def demo_command(options: argparse.Namespace) -> None:
       dsffnet demo
       dsffnet demo --model runs/quickstart --port 8001
     """
-    require_free(options.host, options.port, another=f"dsffnet demo --port {options.port + 1}")
+    require_free(options.host, options.port, another="dsffnet demo --port {0}")
     with weights_of(options) as weights:
         with saying_what_it_does() as say:
             say("loading the libraries")

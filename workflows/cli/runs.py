@@ -43,6 +43,7 @@ def train_command(options: argparse.Namespace) -> None:
 
     recipe = load_recipe(options.recipe, options.set).training
     run = RunFolder(Path(require_reachable(options.out, option="--out")))
+    run.require_kind()
     data = require_reachable(options.data, option="--data", urls=True)
     check_run_accepts(recipe, open_dataset(data), run.path if not options.fresh else run.path / "none")
     if options.fresh:

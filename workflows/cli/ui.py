@@ -34,7 +34,7 @@ def ui_command(options: argparse.Namespace) -> None:
             f"{database} is not there yet: python workflows/full.py makes it; for another folder: dsffnet ui FOLDER"
         )
     port = options.port
-    require_free("127.0.0.1", port, another=f"dsffnet ui --port {port + 1}, or make ui UI_PORT={port + 1}")
+    require_free("127.0.0.1", port, another="dsffnet ui --port {0}, or make ui UI_PORT={0}")
     server = _server(database, port)
     print(_addresses(database, port), flush=True)
     status = _serve(server, ended=_parent_is_gone())
@@ -63,7 +63,7 @@ def _addresses(database: Path, port: int) -> str:
 
 
 def require_free(host: str, port: int, *, another: str) -> None:
-    """Refuse a port that cannot be listened at; ``another``: what to type for another one.
+    """Refuse a port that cannot be listened at; ``another``: what to type for the other one ``{0}``.
 
     Raises
     ------
@@ -76,7 +76,8 @@ def require_free(host: str, port: int, *, another: str) -> None:
             probe.bind((host, port))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise PageError(f"port {port} of {host} cannot be used ({reason}). Another: {another}") from error
+            other = another.format(port + 1 if 0 < port < 65535 else 8080)
+            raise PageError(f"port {port} of {host} cannot be used ({reason}). Another: {other}") from error
 
 
 def _parent_is_gone() -> Callable[[], bool]:

@@ -6,12 +6,15 @@ import gc
 import io
 import logging
 import os
+import re
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from datagen.common.errors import DsffnetError, RecipeError, reason_of
 from datagen.common.printable import printable, printable_lines
@@ -31,6 +34,7 @@ _GARBAGE = 10_000, 20, 50
 """Of ``gc.set_threshold``: at its own, 700, 10 and 10, a tenth of a command's time goes into looking for garbage among
 what imports and bodies have made.
 """
+_EMPTY = re.compile("--[a-z-]+=")
 _LESS = "lower counts, vertices, training.batch or widths"
 
 
@@ -39,7 +43,7 @@ def guarded(main: Callable[[], None]) -> None:
 
     What the terminal's encoding lacks is written with escapes.
     Status 0: done, 1: failed, 2: usage or invalid recipe, 75: time budget spent, 130: interrupted, 143: told to stop,
-    129: the terminal was closed.
+    129: the terminal was closed, 141: nobody reads what it prints any more, as after ``| head``.
     """
     gc.set_threshold(*_GARBAGE)
     _prepare_output()
@@ -47,7 +51,7 @@ def guarded(main: Callable[[], None]) -> None:
     told = _heed_signals()
     try:
         _require_text(sys.argv[1:])
-        main()
+        _flushed(main)
     except DsffnetError as error:
         _fail(str(error), error.exit_status)
     except KeyboardInterrupt as interrupt:
@@ -58,6 +62,9 @@ def guarded(main: Callable[[], None]) -> None:
         log.debug("as raised", exc_info=True)
         _fail(f"{error.object[:300]!r} is not UTF-8 text, which a name must be here. Rename it")
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _is_closed(sys.stdout):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left at exit goes nowhere
+            sys.exit(128 + signal.SIGPIPE)
         log.debug("as raised", exc_info=True)
         advice = "choose a shorter one" if error.errno == errno.ENAMETOOLONG else "repair this"
         _fail(f"{error}. Nothing that was complete is lost; {advice} and run again")
@@ -66,6 +73,26 @@ def guarded(main: Callable[[], None]) -> None:
             raise
         log.debug("as raised", exc_info=True)
         _fail(f"memory ran out ({reason_of(error)}). Nothing that was complete is lost; {_LESS}, and run again")
+
+
+def _flushed(main: Callable[[], None]) -> None:
+    """Run a command and write out what it printed, be it help, here where a closed pipe can be told."""
+    try:
+        main()
+    except SystemExit:
+        print(end="", flush=True)
+        raise
+    print(end="", flush=True)
+
+
+def _is_closed(stream: TextIO) -> bool:
+    """Whether a stream is a pipe that nobody reads from."""
+    poll = select.poll()
+    try:
+        poll.register(stream, 0)  # errors are always told
+    except (TypeError, ValueError):  # no stream, or none of the system's
+        return False
+    return bool(poll.poll(0))
 
 
 def _prepare_output() -> None:
@@ -97,7 +124,13 @@ def _heed_signals() -> list[int]:
 
 
 def _require_text(words: Sequence[str]) -> None:
-    """Refuse names that this shell's encoding lacks: Ray, MLflow and records would write others."""
+    """Refuse empty words, which would mean this folder, and names that this shell's encoding lacks: Ray, MLflow and
+    records would write others.
+    """
+    for option, word in pairwise(("the first word", *words)):
+        if (not word and option != "--prefix") or (word != "--prefix=" and _EMPTY.fullmatch(word)):
+            where = word.rstrip("=") or option
+            raise RecipeError(f"{where!r} is followed by an empty text, as of an unset variable. Name a file or folder")
     encoding = sys.getfilesystemencoding()
     unreadable = [word for word in (*words, os.getcwd()) if any("\udc80" <= letter <= "\udcff" for letter in word)]
     if unreadable and encoding != "utf-8":

@@ -25,7 +25,7 @@ def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
     ------
     RecipeError
         A relative path while running on a cluster, where the working directory is a throw-away copy; a URL where
-        only a folder will do; or a name that no page, log or server could show.
+        only a folder will do; a name that no page, log or server could show; or --data that is a workflow's folder.
     """
     if printable(place) != place:
         raise RecipeError(
@@ -35,6 +35,8 @@ def require_reachable(place: str, *, option: str, urls: bool = False) -> str:
         if urls:
             return place
         raise RecipeError(f"{option} {place!r} is a URL; runs are kept in a folder, on a disk that all machines share")
+    if option == "--data" and os.path.isdir(os.path.join(place, "dataset.zarr")):
+        raise RecipeError(f"{option} {place} is a workflow's folder. Name the dataset in it: {place}/dataset.zarr")
     if os.path.isabs(place):
         return place
     if on_cluster():

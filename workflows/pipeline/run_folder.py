@@ -41,8 +41,12 @@ def _file(name: str, *, kept: bool = False) -> _Entry[Path]:
 
 
 class _Folder:
-    """A folder that we write: ``names`` of its entries (with wildcards), and those ``kept`` when all is removed."""
+    """A folder that we write: ``names`` of its entries (with wildcards), and those ``kept`` when all is removed.
 
+    ``kind``: of the work that has its record in it.
+    """
+
+    kind: ClassVar[str]
     names: ClassVar[tuple[str, ...]] = ("*.unreadable",)
     kept: ClassVar[tuple[str, ...]] = ()
     record = _file("record.json")
@@ -73,21 +77,40 @@ class _Folder:
             else:
                 path.unlink()
 
+    def require_kind(self) -> None:
+        """Refuse a folder whose record, of another kind of work, would be replaced, and see :func:`require_place`.
+
+        Raises
+        ------
+        RecipeError
+            It is one.
+        """
+        require_place(self.path)
+        record = read_record(self.path)
+        if record and record.kind != self.kind:
+            raise RecipeError(
+                f"{self.path} is the folder of another kind of work: {record.kind} {record.name!r}. "
+                "Choose another --out"
+            )
+
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Hold the folder, which is made, while the block runs; the operating system frees it if this process dies.
 
         Raises
         ------
+        RecipeError
+            See :meth:`require_kind`.
         WorkflowError
             Another process holds it, or it is a link to what is not there.
         """
+        self.require_kind()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
             raise WorkflowError(
-                f"{self.path} leads to {os.path.realpath(self.path)}, which is not there or no folder. Mount or make "
-                "it, or choose another --out"
+                f"{self.path} leads to {os.path.realpath(self.path)}, which is not there. Mount or make it, "
+                "or choose another --out"
             ) from error
         try:
             with lock_within(self.path, self.lock.name).acquire(timeout=0):
@@ -104,6 +127,7 @@ class _Folder:
 class EvaluationFolder(_Folder):
     """HOME/evaluation[-DATASET][-LABEL], or OUT/evaluation of a comparison."""
 
+    kind = "evaluate"
     rows = _file("rows.csv")
     tables = _file("tables.md")
     viewer = _file("viewer.html")
@@ -121,6 +145,7 @@ class EvaluationFolder(_Folder):
 class RunFolder(_Folder):
     """The folder of one training."""
 
+    kind = "train"
     names = (*_Folder.names, "evaluation-*")
     recipe = _file("recipe.yaml")
     provenance = _file("provenance.json")
@@ -166,7 +191,7 @@ class RunFolder(_Folder):
 class WorkflowFolder(_Folder):
     """The folder of a workflow, or of another ``kind`` of work that makes a dataset and trains on it."""
 
-    kind: ClassVar[str] = "workflow"
+    kind = "workflow"
     names = (*_Folder.names, "mlflow.db*")
     kept = (*_Folder.kept, "mlflow.db*")
     recipe = _file("recipe.yaml")
@@ -182,21 +207,6 @@ class WorkflowFolder(_Folder):
     def data(self) -> str:
         """The URL of the dataset."""
         return str(self.dataset)
-
-    def require_kind(self) -> None:
-        """Refuse a folder that another kind of work has its record in, which would be replaced.
-
-        Raises
-        ------
-        RecipeError
-            It is one.
-        """
-        record = read_record(self.path)
-        if record and record.kind != self.kind:
-            raise RecipeError(
-                f"{self.path} is the folder of another kind of work: {record.kind} {record.name!r}. "
-                "Choose another --out"
-            )
 
     def remove(self) -> None:
         """Remove what the work keeps in the folder, its dataset too; the MLflow store stays.
@@ -278,6 +288,21 @@ class AblationFolder(ComparisonFolder):
     """The folder of the ablations."""
 
     kind = "ablation"
+
+
+def require_place(path: Path) -> None:
+    """Refuse what is a file or a dataset, or lies in one: no folder of work can be made there.
+
+    Raises
+    ------
+    RecipeError
+        It does.
+    """
+    place = Path(os.path.realpath(path))
+    for each in (place, *place.parents):
+        if each.is_file() or (each / "zarr.json").is_file():
+            what = "file" if each.is_file() else "dataset"
+            raise RecipeError(f"{path} is the {what} {each}, or lies in it. Choose another --out, a folder of its own")
 
 
 def _matches(path: Path, names: tuple[str, ...]) -> bool:

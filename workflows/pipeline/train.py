@@ -16,7 +16,7 @@ from datagen.store.schema import open_group
 from training.checkpoints.checkpoint import is_finished, load_checkpoint, require_checkpoint
 from training.data.triples import last_step_of, order_of
 from training.engine.launch import launch
-from training.engine.resume import require_same_training
+from training.engine.resume import newest_of, require_same_training
 from training.evaluation.document import plain
 from training.inference.domain_check import noted, seen_in
 from training.objectives import PMD_UNIT
@@ -174,7 +174,7 @@ def check_run_accepts(recipe: TrainingRecipe, dataset: Dataset, run: Path, *, se
     CheckpointError, RecipeError
         It did; the message says what differs.
     """
-    if found := load_checkpoint(run):
+    if found := newest_of(run):
         require_same_training(recipe, dataset, run, found, section=section)
 
 

@@ -133,13 +133,18 @@ def _with_training(values: dict[str, Any], name: str | None) -> dict[str, Any]:
 
 
 @contextmanager
-def recipe_faults(where: str, *, keys: str = "dsffnet recipe --help-all") -> Iterator[None]:
-    """Turn a failed validation into one line a fault: which key, what is wrong, what was given; ``keys`` lists all."""
+def recipe_faults(
+    where: str, *, model: type[BaseModel] = WorkflowRecipe, keys: str = "dsffnet recipe --help-all"
+) -> Iterator[None]:
+    """Turn a failed validation of a ``model`` into one line a fault: which key, what is wrong, what was given.
+
+    ``keys`` lists all.
+    """
     try:
         yield
     except ValidationError as error:
-        listed: set[str] | None = set() if error.title == WorkflowRecipe.__name__ else None
-        faults = faults_text(error, lambda fault: _describe(fault, listed))
+        listed: set[str] | None = set() if error.title == model.__name__ else None
+        faults = faults_text(error, lambda fault: _describe(fault, listed, model))
         raise RecipeError(f"recipe {where}: {faults}. All keys: {keys}") from error
 
 
@@ -215,20 +220,20 @@ def _find(name_or_file: str) -> Path | dict[str, Any]:
     raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
 
 
-def _describe(fault: Any, listed: set[str] | None) -> str:
+def _describe(fault: Any, listed: set[str] | None, model: type[BaseModel]) -> str:
     """One fault in words; of an unknown key with the keys of its section, unless these are ``listed`` (None: never)."""
     # pydantic puts the name of a union's chosen member into the location; a person never wrote it
     location = [str(part) for part in fault["loc"]]
     parts = zip(["", "", *location], ["", *location], location, strict=False)
     key = ".".join(part for *before, part in parts if not (_is_one_of_several(*before) and part in _MEMBERS))
     if fault["type"] == "extra_forbidden":
-        known = [line.split()[0] for line in describe_fields()]
+        known = [line.split()[0] for line in describe_fields(model)]
         if key.startswith("beside."):
             known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
         section, keys = key.rpartition(".")[0], ""
         if listed is not None and section not in listed:
             listed.add(section)
-            keys = _its_keys(location, section)
+            keys = _its_keys(location, section, model)
         if any(name == key or name.startswith(f"{key}.") for name in known):
             having = _members(section, having=location[-1])
             whose = f"of {', '.join(having)}" if having else f"of another kind of {section!r}"
@@ -242,9 +247,9 @@ def _is_one_of_several(section: str, place: str) -> bool:
     return place in _UNIONS or (section in ("bodies", "parts") and place.isdigit())
 
 
-def _its_keys(location: list[str], section: str) -> str:
+def _its_keys(location: list[str], section: str, model: type[BaseModel]) -> str:
     """Words that list the keys of the section of an unknown key, of the kind that was chosen; ``location`` names it."""
-    models: list[type[BaseModel]] = [WorkflowRecipe]
+    models: list[type[BaseModel]] = [model]
     for part in location[:-1]:
         chosen = [model for model in models if part in (field.default for field in model.model_fields.values())]
         fields = [model.model_fields[part] for model in models if part in model.model_fields]

@@ -21,6 +21,7 @@ from training.evaluation.results import RowType, kept_rows, write_csv
 from training.tracking.record import read_record, update_record
 from workflows.pipeline.console import print_text
 from workflows.pipeline.ray_cluster import require_reachable
+from workflows.pipeline.run_folder import require_place
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.weights_argument import Evaluated, evaluated
 
@@ -37,9 +38,16 @@ def weights_of(options: argparse.Namespace) -> list[Evaluated]:
     ------
     CheckpointError
         A place has none, or they are damaged.
+    RecipeError
+        Some are named twice.
     """
     places = [Path(require_reachable(run, option="RUN")) for run in options.runs]
-    return [evaluated(place, options.checkpoint) for place in places]
+    found = [evaluated(place, options.checkpoint) for place in places]
+    known = [each.weights.resolve() for each in found]
+    twice = [str(place) for place, its in zip(places, known, strict=True) if known.count(its) > 1]
+    if twice:
+        raise RecipeError(f"{' and '.join(twice)} are the same weights. Name each once")
+    return found
 
 
 def methods_of(weights: Sequence[Evaluated]) -> list[LoadedMethod]:
@@ -60,10 +68,11 @@ def folder_of(options: argparse.Namespace, weights: Sequence[Evaluated], study: 
     Raises
     ------
     RecipeError
-        The folder that was asked for holds another run's record, or rows of something else.
+        The folder that was asked for is a dataset, or holds another run's record or rows of something else.
     """
     if options.out:
         folder = Path(require_reachable(options.out, option="--out"))
+        require_place(folder)
         _require_own(folder, study)
         return folder
     if len(weights) > 1:

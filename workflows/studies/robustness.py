@@ -114,8 +114,9 @@ def _asked(options: argparse.Namespace) -> list[Disturbance]:
     unknown = [name for name in options.only or () if name not in _KNOWN]
     if unknown:
         raise RecipeError(f"--only {unknown[0]}: there is no such disturbance. Choose from {', '.join(_KNOWN)}")
-    if options.triples < 1 or options.emd_points < 0:
-        raise RecipeError(f"--triples {options.triples} --emd-points {options.emd_points}: use 1 and 0 or more")
+    for option, given, least in (("--triples", options.triples, 1), ("--emd-points", options.emd_points, 0)):
+        if given < least:
+            raise RecipeError(f"{option} {given}: use {least} or more")
     return [disturbance for disturbance in DISTURBANCES if not options.only or disturbance.name in options.only]
 
 

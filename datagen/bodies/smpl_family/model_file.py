@@ -170,7 +170,7 @@ def convert_model(source: Path, out: Path) -> Path:
     Raises
     ------
     BodyError
-        ``source`` is no usable model file, or ``out`` is not called .npz.
+        ``source`` is no usable model file, or ``out`` is not called .npz or another file that is there.
     StorageError
         ``out`` could not be written.
     """
@@ -182,7 +182,17 @@ def convert_model(source: Path, out: Path) -> Path:
 
 
 def write_model(out: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write arrays as an .npz, whole or not at all; the same arrays give the same bytes."""
+    """Write arrays as an .npz, whole or not at all; the same arrays give the same bytes.
+
+    Raises
+    ------
+    BodyError
+        Another file is there.
+    StorageError
+        It could not be written.
+    """
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **{key: np.asarray(array, order="C") for key, array in arrays.items()})
+    if out.is_file() and out.read_bytes() != content.getvalue():
+        raise BodyError(f"{out} is there, and another file than would be written. Choose another --out, or remove it")
     write_atomically(out, content.getvalue())

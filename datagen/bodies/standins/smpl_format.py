@@ -60,7 +60,7 @@ def write_standin(kind: StandInKind, out: Path, *, topology: AnnyTopology = "not
     Raises
     ------
     BodyError
-        Unknown kind, or a name that does not end in .npz.
+        Unknown kind, a name that does not end in .npz, or another file of that name is there.
     StorageError
         The file could not be written.
     """

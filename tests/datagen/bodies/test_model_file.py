@@ -32,6 +32,14 @@ def test_pickle_and_its_conversion_give_identical_vertices(protocol: int, tmp_pa
     assert np.array_equal(bodies[0].vertices(betas, poses), bodies[1].vertices(betas, poses))
     again = convert_model(converted, tmp_path / "again.npz")
     assert again.read_bytes() == converted.read_bytes()
+    assert convert_model(original, converted) == converted, "the same bytes"
+
+
+def test_conversion_leaves_another_file_alone(tmp_path: Path) -> None:
+    (tmp_path / "licensed.npz").write_text("precious")
+    with pytest.raises(BodyError, match=r"licensed\.npz is there, and another file than would be written"):
+        convert_model(save_npz(tmp_path / "mine.npz", arrays_of("smpl")), tmp_path / "licensed.npz")
+    assert (tmp_path / "licensed.npz").read_text() == "precious"
 
 
 def test_conversion_leaves_nothing_half_done(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from datagen import generate as generation
 from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import ensure_shards, generate, inline, make_shard, shards
+from datagen.generate.plan import plan_of
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
@@ -192,3 +193,19 @@ def test_more_identities_leave_the_first_ones_as_they_were() -> None:
     for number in (0, 2):
         small_shard, large_shard = (shards_of(recipe)[number * 2] for recipe in (small, large))
         assert np.array_equal(vertices_of(small, small_shard), vertices_of(large, large_shard))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"identities": {"training": 3, "evaluation": 1}}, "only 0 of seen poses and 0 of unseen poses"),
+        ({"triples": {"count": 90}}, "asks for 90 evaluation triples, but there are only 72 of unseen poses"),
+        ({"identities": {"training": 3, "evaluation": 1}, "triples": {"count": 0}}, ""),
+        ({}, ""),
+    ],
+)
+def test_too_few_evaluation_triples_are_warned_of(
+    caplog: pytest.LogCaptureFixture, changes: dict[str, Any], says: str
+) -> None:
+    plan_of(tiny_dataset(**changes))
+    assert len(caplog.messages) == bool(says) and says in "".join(caplog.messages)

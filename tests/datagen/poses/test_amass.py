@@ -148,7 +148,7 @@ def test_motions_that_cannot_be_used(tmp_path: Path) -> None:
         load_poses(recipe_of(tmp_path / "empty"))
     with pytest.raises(RecipeError, match=r"wide\.npz: poses have shape \(200, 90\)"):
         draw_poses(recipe_of(motion(tmp_path / "wide.npz", width=90)), range(1))
-    with pytest.raises(RecipeError, match=r"nan\.npz: 200 frames are not finite.*the first is 0"):
+    with pytest.raises(RecipeError, match=r"nan\.npz: not finite.*200 frames, the first is 0"):
         draw_poses(recipe_of(motion(tmp_path / "nan.npz", mark=np.nan)), range(1))
     with pytest.raises(RecipeError, match=r"none\.npz: poses have shape \(0, 156\)"):
         draw_poses(recipe_of(motion(tmp_path / "none.npz", frames=0)), range(1))
@@ -191,5 +191,5 @@ def test_some_motions_are_held_out_unless_said_otherwise(tmp_path: Path) -> None
 
 
 def test_numbers_that_are_no_angles(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match=r"far\.npz: 200 frames are not finite, or far from any angle"):
+    with pytest.raises(RecipeError, match=r"far\.npz: not finite, or far from any angle: 200 frames"):
         draw_poses(recipe_of(motion(tmp_path / "far.npz", mark=1e300)), range(1))

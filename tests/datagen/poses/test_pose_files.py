@@ -53,7 +53,7 @@ def test_poses_over_a_few_joints_turn_a_body_as_the_full_tree_would(tmp_path: Pa
 
 
 def test_too_few_poses_are_refused_with_the_counts(tmp_path: Path) -> None:
-    write_pose_file(tmp_path / "p.npz", Poses(("pelvis",), (-1,), np.arange(15.0).reshape(5, 1, 3)))
+    write_pose_file(tmp_path / "p.npz", Poses(("pelvis",), (-1,), np.arange(15.0).reshape(5, 1, 3) / 9))
     with pytest.raises(RecipeError, match=r"asks for 6 poses \(4 seen \+ 2 unseen\), but .*p\.npz has 5"):
         load_poses(recipe_of(tmp_path / "p.npz"))
     with pytest.raises(RecipeError, match=r"asks for 6 poses, but .* has 5"):  # appended later
@@ -70,14 +70,18 @@ def test_too_few_poses_are_refused_with_the_counts(tmp_path: Path) -> None:
         ({"poses": np.full((6, 1, 3), "a"), "joints": np.array(["pelvis"])}, "must be numbers"),
         (
             {"poses": np.full((6, 1, 3), 1e300), "joints": np.array(["pelvis"])},
-            "6 poses are not finite, or far from any",
+            "not finite, or far from any angle in radians: 6 poses, the first is number 0",
+        ),
+        (
+            {"poses": [[[0, 0, 0]], [[0, 90, 0]]], "joints": np.array(["pelvis"])},
+            r"pose 1 turns joint 0 \('pelvis'\) by 90, more than two turns .* are these degrees\? they must be radians",
         ),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array(["a"]), "parents": np.array(["b"])}, "whole numbers"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array(["a"]), "parents": np.array([[-1, 0]])}, r"shape \(1, 2\)"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array(["a"]), "parents": np.array([-1.5])}, "type float64"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array([["a"]])}, r"`joints` has shape \(1, 1\)"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array([b"a"])}, "`joints` has .* must be names"),
-        ({"poses": np.full((6, 1, 3), np.inf), "joints": np.array(["pelvis"])}, "6 poses are not finite"),
+        ({"poses": np.full((6, 1, 3), np.inf), "joints": np.array(["pelvis"])}, "not finite"),
         ({"poses": np.zeros((6, 2, 3)), "joints": np.array(["head", "head"])}, "names 'head' twice"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array(["a"]), "parents": np.array([-1, 0])}, "2 parents for 1"),
         ({"poses": np.zeros((6, 1, 3)), "joints": np.array(["a"]), "parents": np.array([0])}, "has parent 0"),
@@ -99,6 +103,7 @@ def test_no_pose_file(tmp_path: Path) -> None:
 
 def test_a_pose_cannot_be_seen_and_unseen(tmp_path: Path) -> None:
     rotations = np.arange(18.0).reshape(6, 1, 3)
+    rotations[3:] /= 9
     rotations[1] = rotations[5] = [-0.0, 1, 2]
     rotations[5, 0, 0] = 0.0
     write_pose_file(tmp_path / "p.npz", Poses(("pelvis",), (-1,), rotations))

@@ -1,7 +1,10 @@
 """The NPT joint ranges, and poses as functions of (seed, number)."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from datagen.common.errors import RecipeError
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses, load_poses
@@ -95,6 +98,21 @@ def test_uniform_ranges_over_smal() -> None:
 def test_a_range_of_an_unknown_joint_is_refused() -> None:
     with pytest.raises(RecipeError, match="no joint 'wing'"):
         load_poses(PoseRecipe(distribution=RangePoses(degrees={"wing": ((0, 1), (0, 1), (0, 1))})))
+
+
+@pytest.mark.parametrize(
+    ("distribution", "says"),
+    [
+        ({}, "makes all poses the same. Set uniform=DEGREES .* or degrees="),
+        ({"degrees": {"head": ((5, 5), (0, 0), (0, 0))}}, "makes all poses the same"),
+        ({"uniform": 361}, "uniform"),
+        ({"degrees": {"head": ((0, 0), (-400, 0), (0, 0))}}, "degrees.head.1.0"),
+    ],
+)
+def test_ranges_that_cannot_be_meant(distribution: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValidationError, match=f"(?s){says}"):
+        PoseRecipe.model_validate({"distribution": {"name": "ranges", **distribution}})
+    PoseRecipe.model_validate({"distribution": {"name": "ranges"}, "seen": 1, "unseen": 0})
 
 
 def turned(joint: str, axis: int, degrees: float) -> Poses:

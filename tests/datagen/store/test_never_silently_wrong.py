@@ -20,7 +20,7 @@ from datagen.mesh.geometry import bounds
 from datagen.recipe import DatasetRecipe
 from datagen.store import manifest, open_dataset, writer
 from datagen.store.schema import open_group
-from datagen.store.verify import find_faults
+from datagen.store.verify import find_faults, require_recipe
 from datagen.store.writer import ShardWriter
 from tests.support.files import flip_bit, tree_hash
 from tests.support.recipes import shards_of, tiny_dataset
@@ -84,7 +84,7 @@ def test_a_late_task_of_another_recipe_writes_nothing(spoilable: Path) -> None:
 
 def test_shards_without_a_root_are_not_adopted(spoilable: Path) -> None:
     (spoilable / "zarr.json").unlink()
-    with pytest.raises(DatasetError, match="holds what is not a dataset"):
+    with pytest.raises(DatasetError, match=r"has lost its zarr\.json"):
         generate(OTHER, str(spoilable))
 
 
@@ -129,6 +129,37 @@ def test_repair_does_not_trust_a_recipe_that_was_changed_by_hand(spoilable: Path
     stored = open_group(str(spoilable)).attrs["recipe"]
     with pytest.raises(DatasetError, match=r"another recipe|not the one that it was made by"):
         repair(str(spoilable), DatasetRecipe.model_validate(stored), list(find_faults(str(spoilable))))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [('"seed": 0', '"seed": 5', "not the one that it was made by"), ('"Y up', '"Z up', "not as they were written")],
+)
+def test_a_recipe_is_not_taken_from_attributes_that_were_changed_by_hand(
+    spoilable: Path, old: str, new: str, says: str
+) -> None:
+    root = spoilable / "zarr.json"
+    root.write_text(root.read_text().replace(old, new))
+    with pytest.raises(DatasetError, match=says):
+        require_recipe(str(spoilable))
+
+
+@pytest.mark.parametrize("content", [None, "", "\0\0\0"])
+def test_a_dataset_that_lost_its_root_is_made_again_as_the_message_says(
+    dataset: str, spoilable: Path, content: str | None
+) -> None:
+    root, url = spoilable / "zarr.json", str(spoilable)
+    root.unlink() if content is None else root.write_text(content)
+    again = rf"zarr\.json.* cannot be read.*: dsffnet generate --recipe RECIPE --out {url} --fresh"
+    for use in (open_dataset, require_recipe, lambda url: generate(tiny_dataset(), url)):
+        with pytest.raises(DatasetError, match=again):
+            use(url)
+    (spoilable / "grid" / "thesis.txt").write_text("precious")
+    with pytest.raises(DatasetError, match="holds what is not a dataset"):
+        generate(tiny_dataset(), url, fresh=True)
+    (spoilable / "grid" / "thesis.txt").unlink()
+    generate(tiny_dataset(), url, fresh=True)
+    assert tree_hash(spoilable) == tree_hash(dataset)
 
 
 def test_growing_from_what_is_no_longer_there_is_refused(spoilable: Path) -> None:

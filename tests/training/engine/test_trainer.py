@@ -99,12 +99,17 @@ def test_blocks_are_resumed_to_the_bit_by_any_cache_and_are_no_other_runs(datase
 
 
 def test_a_damaged_newest_checkpoint_costs_only_the_steps_since_the_one_before(
-    dataset: str, undisturbed: Path, tmp_path: Path
+    dataset: str, undisturbed: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     damaged = tmp_path / "damaged"
     shutil.copytree(undisturbed, damaged)
     flip_bit(damaged / "checkpoints" / "step-00000008" / "weights.safetensors")
     train(tiny_training(), data=dataset, run=damaged)
+    assert same_bits(damaged, undisturbed)
+    for name in ("step-00000004", "step-00000008"):
+        flip_bit(damaged / "checkpoints" / name / "weights.safetensors")
+    train(tiny_training(), data=dataset, run=damaged)
+    assert caplog.text.count("no sound checkpoint is left in") == 1 and "starts again from step 0" in caplog.text
     assert same_bits(damaged, undisturbed)
 
 
@@ -126,6 +131,7 @@ def test_nan_on_one_rank_stops_both_before_the_step(
     assert first and second
     assert "not finite at step 7 (on another rank)" in said
     assert "not finite at step 7 (this rank's examples were [[" in said_by_culprit
+    assert "The last good checkpoint is kept" in said_by_culprit
     assert require_checkpoint(tmp_path / "run").step == 4
     assert all(torch.isfinite(value).all() for value in weights(tmp_path / "run").values())
 

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.text import Text
 from PIL import Image
 
 from datagen.common.errors import DatasetError
 from datagen.generate import generate
 from tests.support.recipes import tiny_dataset
+from tests.support.reports.pictures import caught
 from training.evaluation.generalisation import (
     NO_OP,
     GeneralisationRow,
@@ -25,6 +27,7 @@ from training.evaluation.generalisation import (
 from training.evaluation.measure import LoadedMethod
 from training.evaluation.results import kept_rows, write_csv
 from training.networks import NETWORKS
+from training.reports.plots import generalisation as module
 from training.reports.plots.generalisation import Shown, generalisation_picture, heat_map
 
 
@@ -116,7 +119,11 @@ def test_a_kind_without_triples_is_refused(tmp_path: Path) -> None:
 
 
 def test_heat_map_and_picture_are_drawn(
-    tmp_path: Path, kinds: list[MeshKind], method: LoadedMethod, rows: list[GeneralisationRow]
+    tmp_path: Path,
+    kinds: list[MeshKind],
+    method: LoadedMethod,
+    rows: list[GeneralisationRow],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     names = [kind.name for kind in kinds]
     with Image.open(heat_map(rows, names, tmp_path / "heat.png", title="tiny", trained=[names[1]])) as picture:
@@ -132,5 +139,10 @@ def test_heat_map_and_picture_are_drawn(
         last = np.asarray(picture.convert("RGB"))[:, -226:-16].astype(int)
     top, bottom = np.array_split(last[90:], 2)
     assert (top[:240].min(-1) < 240).sum() > 500 > (bottom[20:240].min(-1) < 200).sum(), "truth above, none below"
+    figures = caught(monkeypatch, module)
+    heat_map(rows, names[:2], "unused.png", title="a title of some words; " * 6)
+    figures[0].draw_without_rendering()
+    (title,) = [text for text in figures[0].findobj(Text) if text.get_text().startswith("a title")]
+    assert title.get_window_extent().x1 <= figures[0].bbox.x1, "a narrow figure cuts nothing of its title"
     with pytest.raises(ValueError, match="no numbers"):
         heat_map([], names, tmp_path / "none.png", title="")

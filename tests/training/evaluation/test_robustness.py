@@ -13,6 +13,7 @@ from datagen.common.errors import DatasetError
 from datagen.generate import generate
 from datagen.store import open_dataset
 from tests.support.recipes import tiny_dataset
+from tests.support.reports.pictures import caught
 from training.data.batch import read_batch
 from training.evaluation.disturbances import DISTURBANCES, Disturbance
 from training.evaluation.measure import LoadedMethod, score
@@ -31,6 +32,7 @@ from training.evaluation.robustness import (
 )
 from training.networks import NETWORKS
 from training.objectives.metrics import point_mesh_distance
+from training.reports.plots import robustness as module
 from training.reports.plots.robustness import disturbance_picture, robustness_curves
 from training.viz.style import method_colors
 
@@ -139,7 +141,7 @@ def test_scores_are_zero_for_the_truth_and_the_earth_mover_is_optional(dataset: 
 
 
 def test_curves_and_picture_are_drawn(
-    tmp_path: Path, dataset: str, method: LoadedMethod, rows: list[RobustnessRow]
+    tmp_path: Path, dataset: str, method: LoadedMethod, rows: list[RobustnessRow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Image.open(robustness_curves(rows, tmp_path / "curves.png", title="tiny")) as picture:
         colors = np.asarray(picture.convert("RGB")).reshape(-1, 3)
@@ -151,5 +153,11 @@ def test_curves_and_picture_are_drawn(
     with Image.open(path) as picture:
         blue = np.asarray(picture.convert("RGB")).astype(int)
         assert ((blue[..., 2] - blue[..., 0]) > 40).sum() > 500, "sources stand there, points too"
+    figures, noisy = caught(monkeypatch, module), [row for row in rows if row.disturbance in ("", "noise")]
+    both = [*noisy, *(replace(row, method="another network of a long name") for row in noisy)]
+    robustness_curves(both, "unused.png", title="one panel")
+    figures[0].draw_without_rendering()
+    words = figures[0].legends[0].get_window_extent()
+    assert words.x0 >= 0 and words.x1 <= figures[0].bbox.x1, "a narrow figure cuts nothing of its legend"
     with pytest.raises(ValueError, match="no rows"):
         robustness_curves([], tmp_path / "none.png", title="")

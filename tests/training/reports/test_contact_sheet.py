@@ -33,7 +33,7 @@ def test_unseen_and_appended_poses_are_shown_and_what_is_not_there_is_said(
 
     monkeypatch.setattr("training.reports.contact_sheet.mesh_grid", noted)
     picture = imread(draw_contact_sheet(dataset, tmp_path / "sheet.png"))
-    kinds = {"seen", "unseen", "seen, appended", "unseen, appended"}
+    kinds = {"seen", "unseen", "seen,\nappended", "unseen,\nappended"}
     assert {label.partition("\n")[2] for label in shown["columns"]} == kinds
     assert {row.label.partition("\n")[2] for row in shown["rows"]} == {"training", "evaluation", "training,\nappended"}
     for row in shown["rows"]:

@@ -98,6 +98,17 @@ def test_lines_are_named_in_the_order_of_their_ends_and_the_best_finished_one_is
     assert "far above" not in texts(drawn[1], 0)
 
 
+@pytest.mark.parametrize("steps", [4.0, 10.0, 20_000.0])
+def test_numbers_along_steps_and_seconds_are_true(drawn: list[Figure], steps: float) -> None:
+    places = np.linspace(0, steps, 5)
+    sweep_figure([RunCurve("a", places, places / 8000, np.full(5, 0.1), True)], "unused.png")
+    for axes, whole in zip(drawn[0].axes, (True, False), strict=True):
+        axis = axes.xaxis
+        said = [axis.get_major_formatter()(place, 0) for place in axis.get_majorticklocs()]
+        assert [float(word.replace(",", "")) for word in said] == pytest.approx(list(axis.get_majorticklocs()))
+        assert len(set(said)) > 2 and (not whole or not any("." in word for word in said))
+
+
 def test_many_runs_with_one_end_have_names_that_do_not_overlap(drawn: list[Figure]) -> None:
     sweep_figure([curve(f"trial-{i}", 0.5, 0.1) for i in range(20)], "unused.png")
     axes = drawn[0].axes[0]

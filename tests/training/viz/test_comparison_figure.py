@@ -136,6 +136,16 @@ def test_methods_have_their_numbers_the_best_in_bold_and_without_a_truth_there_a
     assert {"NPT", "DSFFNet", "off by 0.1"} <= set(without)
 
 
+def test_bold_is_the_least_of_the_numbers_it_stands_among(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bars show mean errors, the words under the pictures PMD, which squares."""
+    figures, row = caught(monkeypatch, module), comparison(steady=0.1, spiky=0.0)
+    row.outputs["spiky"].vertices[0] += (0, 0.3, 0)
+    comparison_figure([row], "unused.png", panel=PANEL)
+    weights = words(figures[0])
+    assert weights["10.00"] == weights["off by 0.0"] == "normal"
+    assert weights["5.00"] == weights["off by 0.1"] == "bold"
+
+
 def long_body(shift: float = 0.0) -> Mesh:
     body = octahedron()
     return Mesh(body.vertices * (0.3, 0.6, 1.5) + (shift, 0, 0), body.faces)

@@ -77,6 +77,7 @@ def test_the_recipes_that_come_along_can_be(name: str) -> None:
     [
         ("avatar.network.map_size=100", r"map_size must be a power of two, got 100"),
         ("field.spacing=9", r"field.spacing"),
+        ("training.steps=-1", r"unknown key 'training'.* \(a recipe has description, data, people, field, "),
         ("fields.spacing=9", r"unknown key 'fields.spacing'|unknown key 'fields'"),
     ],
 )

@@ -100,7 +100,7 @@ def test_generate_inspect_verify_repair(tmp_path: Path) -> None:
     )
     assert command("verify", data).stdout.endswith("is whole\n")
     flip_bit(data / "grid/training/0/vertices/c/2/1/0/0")
-    fails(command("verify", data), 1, "has 1 faults", f"dsffnet verify {data} --repair")
+    fails(command("verify", data), 1, "has 1 fault. ", f"dsffnet verify {data} --repair")
     assert "grid/training/0/vertices/c/2/1/0/0: its hash" in command("verify", data).stdout
     assert "is whole again" in command("verify", data, "--repair").stdout
     assert command("verify", data).returncode == 0
@@ -141,7 +141,8 @@ def test_a_checkpoint_is_chosen(trained: tuple[Path, Path], tmp_path: Path) -> N
     meshes = ("--source", tmp_path / "a.obj", "--target", tmp_path / "a.obj", "--out", tmp_path / "b.obj")
     done = command("transfer", "--model", trained[1], "--checkpoint", "4", *meshes)
     assert done.returncode == 0, done.stderr
-    fails(command("transfer", "--model", trained[1], "--checkpoint", "5", *meshes), 1, "step-00000005")
+    missing = command("transfer", "--model", trained[1], "--checkpoint", "5", *meshes)
+    fails(missing, 1, "step-00000005 is not there. Name another step: 4, 8")
     assert command("transfer", "--model", trained[1], "--checkpoint", "newest", *meshes).returncode == 2
 
 
@@ -174,9 +175,12 @@ def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: 
     (tmp_path / "workflow" / "dataset.txt").write_text("precious")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("precious")
-    for place in ("workflow", "other"):
+    for place, says in (
+        ("workflow", "is the folder of another kind of work: workflow 'w'"),
+        ("other", "is not the folder of a training, so --fresh leaves it alone"),
+    ):
         result = command("train", "--recipe", "smoke", "--data", trained[0], "--out", tmp_path / place, "--fresh")
-        fails(result, 2, "is not the folder of a training, so --fresh leaves it alone")
+        fails(result, 2, says)
     assert (tmp_path / "workflow" / "dataset.txt").exists() and (tmp_path / "other" / "thesis.txt").exists()
 
 
@@ -200,12 +204,15 @@ REFUSED: list[tuple[int, str, str, dict[str, str]]] = [
     (2, "--out /data/runs/smoke", "full --recipe smoke", ON_CLUSTER),
     (1, "no Ray head answers at RAY_ADDRESS 127.0.0.1:1", "generate --recipe smoke --out {here}/new", ON_CLUSTER),
     (2, "leaves it alone", "full --recipe smoke --out . --fresh", {}),
-    (1, "file", "full --recipe smoke --out file", {}),
+    (2, "is the file", "full --recipe smoke --out file", {}),
+    (2, "is the dataset", "train --data leg.zarr --out leg.zarr", {}),
+    (2, "is the dataset", "train --data leg.zarr --out leg.zarr/run --fresh", {}),
     (1, "file", "generate --recipe smoke --local --out file/x.zarr", {}),
     (1, "is a file", "generate --recipe smoke --local --out file --fresh", {}),
     (1, "no dataset at", "inspect no.zarr", {}),
     (1, "dsffnet generate", "inspect no.zarr", {}),
     (1, "no dataset at", "train --data no.zarr --out new", {}),
+    (2, "Name the dataset in it: whole/dataset.zarr", "train --data whole --out new", {}),
     (1, "holds no record of a run", "sync .", {}),
     (1, "norun has no usable checkpoint", "evaluate norun --data leg.zarr", {}),
     (2, "nothing to append", "append leg.zarr", {}),
@@ -220,6 +227,13 @@ REFUSED: list[tuple[int, str, str, dict[str, str]]] = [
     (1, "https://smpl.is.tue.mpg.de", "generate --recipe smpl-paper --out new --local", {}),
     (1, "anny-paper", "generate --recipe smpl-paper --out new --local", {}),
     (1, "stand-in", "generate --recipe smpl-paper --out new --local", {}),
+    (1, "after the layout: dsffnet import npt FOLDER", "import npt none --out new --local", {}),
+    (2, "which smal is not made from", "stand-in smal --topology soma --out new.npz", {}),
+    (2, "'--out' is followed by an empty text", "generate --recipe smoke --local --out=", {}),
+    (1, "which is a file", "inspect file", {}),
+    (1, "which holds 'empty.yaml'", "train --data . --out new", {}),
+    (2, "ends in .png", "inspect leg.zarr --picture notes.md", {}),
+    (2, "outside the dataset", "inspect leg.zarr --picture leg.zarr/sheet.png", {}),
 ]
 """Status, what the one line on standard error holds, the command, and its variables."""
 
@@ -231,6 +245,7 @@ def test_what_cannot_be_done_is_one_line_and_changes_nothing(
     here = spoilable.parent
     (here / "file").write_text("in the way")
     (here / "empty.yaml").write_text("")
+    (here / "whole" / "dataset.zarr").mkdir(parents=True, exist_ok=True)
     before = tree_hash(here)
     name, *rest = words.format(here=here, nothing="{nothing}").split()
     given = rest if name == "full" else [name, *rest]
@@ -239,6 +254,10 @@ def test_what_cannot_be_done_is_one_line_and_changes_nothing(
     for lock in here.rglob("*.lock"):
         lock.unlink()
     assert tree_hash(here) == before
+
+
+def test_an_empty_word_is_refused() -> None:
+    fails(command("generate", "--local", "--out", ""), 2, "'--out' is followed by an empty text")
 
 
 def test_a_command_without_what_it_needs_is_a_usage_error() -> None:

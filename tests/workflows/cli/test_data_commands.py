@@ -10,7 +10,7 @@ import numpy as np
 from datagen.bodies import load_body
 from datagen.store import open_dataset
 from tests.support.commands import command, fails
-from tests.support.files import tree_hash
+from tests.support.files import flip_bit, tree_hash
 
 
 class Hostile:
@@ -33,6 +33,8 @@ def test_append_then_make_it_again_from_its_own_attributes(tmp_path: Path) -> No
     data = made(tmp_path / "leg.zarr")
     grown = command("append", data, "--training-identities", "6", "--unseen-poses", "20", "--local")
     assert grown.returncode == 0 and "6 (0-3, 7-8) training" in grown.stdout
+    assert "nothing was to be appended" not in grown.stdout
+    assert "nothing was to be appended" in command("append", data, "--unseen-poses", "20", "--local").stdout
     assert "2 training, 8 unseen" in grown.stdout
     again = command("generate", "--recipe", data, "--out", tmp_path / "again.zarr", "--local")
     assert again.returncode == 0 and tree_hash(data) == tree_hash(tmp_path / "again.zarr")
@@ -48,6 +50,15 @@ def test_inspect_draws_beside_the_dataset_unless_told_otherwise(tmp_path: Path) 
     assert "identities          4 (0-3) training, 3 (4-6) evaluation" in shown.stdout
     picture.unlink()
     assert command("inspect", data, "--picture", "none", folder=tmp_path).returncode == 0 and not picture.exists()
+
+
+def test_inspect_says_why_it_draws_no_picture(spoilable: Path, tmp_path: Path) -> None:
+    path = "grid/training/0/vertices/c/0/0/0/0"
+    flip_bit(spoilable / path)
+    shown, asked = command("inspect", spoilable), command("inspect", spoilable, "--picture", tmp_path / "q.png")
+    fails(asked, 1, "no picture was made", path, f"dsffnet verify {spoilable} --repair")
+    assert shown.returncode == 0 and f"warning: no picture was made: {spoilable}: shard {path}" in shown.stderr
+    assert not list(tmp_path.glob("*.png"))
 
 
 def test_export_then_import(tmp_path: Path) -> None:

@@ -100,6 +100,18 @@ def test_a_closed_terminal_ends_a_command_as_the_other_signals_do(
     assert capsys.readouterr().err == f"{words}; run the same command again to resume\n"
 
 
+@pytest.mark.parametrize("words", [["--help"], ["recipe"]])
+def test_a_pipe_that_is_read_no_more_ends_a_command_without_a_word(words: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command, buffered = [sys.executable, "-m", "workflows", *words], {**os.environ, "PYTHONUNBUFFERED": ""}
+    ended = subprocess.run(
+        command, cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, env=buffered, check=False
+    )
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
 def test_nohup_is_heeded() -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGTERM)}
     signal.signal(signal.SIGHUP, signal.SIG_IGN)

@@ -24,6 +24,14 @@ def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str]) ->
     assert f"port {port} of 127.0.0.1 cannot be used" in said and f"dsffnet demo --port {port + 1}" in said
 
 
+@pytest.mark.parametrize("port", ["65535", "99999"])
+def test_the_other_port_that_is_named_is_one(port: str, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(socket.socket, "bind", lambda *_: (_ for _ in ()).throw(OverflowError("0-65535")))
+    with pytest.raises(SystemExit):
+        cli.main(["demo", "--port", port])
+    assert capsys.readouterr().err.endswith("Another: dsffnet demo --port 8080\n")
+
+
 def test_weights_that_are_not_there_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["demo", "--port", "0", "--model", "no-such-run"])

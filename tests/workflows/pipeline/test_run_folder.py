@@ -7,6 +7,7 @@ import pytest
 
 from datagen.common.errors import RecipeError, WorkflowError
 from tests.support.commands import command
+from tests.support.files import tree_hash
 from training.tracking.record import begin_record
 from workflows.pipeline.run_folder import ComparisonFolder, RunFolder, SingleRunFolder, SweepFolder
 
@@ -65,7 +66,7 @@ def test_a_dataset_that_is_a_link_is_not_removed_elsewhere(tmp_path: Path) -> No
 
 def test_a_folder_that_leads_to_a_disk_that_is_not_there_says_so(tmp_path: Path) -> None:
     (tmp_path / "out").symlink_to(tmp_path / "disk" / "out")
-    says = rf"out leads to {tmp_path}/disk/out, which is not there .*Mount or make it"
+    says = rf"out leads to {tmp_path}/disk/out, which is not there. Mount or make it"
     with pytest.raises(WorkflowError, match=says), SingleRunFolder(tmp_path / "out").alone():
         pytest.fail("it began")
 
@@ -80,6 +81,23 @@ def test_what_a_failed_run_leaves_is_removed_too(out: Path) -> None:
     run.remove()
     assert not [name for name in (*left, "pictures") if (run.path / name).exists()]
     assert (out / "mlartifacts").is_dir(), "of a link, only the link"
+
+
+def test_a_training_is_refused_in_a_workflow_a_dataset_and_a_file(tmp_path: Path) -> None:
+    begin_record(tmp_path / "whole", name="mine", kind="workflow", parent=None, parameters={})
+    (tmp_path / "x.zarr").mkdir()
+    for file in ("x.zarr/zarr.json", "file"):
+        (tmp_path / file).write_text("{}")
+    before = tree_hash(tmp_path)
+    for place, says in (
+        ("whole", "another kind of work: workflow 'mine'"),
+        ("x.zarr", f"is the dataset {tmp_path}/x.zarr, or lies in it"),
+        ("x.zarr/run", f"x.zarr/run is the dataset {tmp_path}/x.zarr, or lies in it"),
+        ("file", f"is the file {tmp_path}/file, or lies in it"),
+    ):
+        with pytest.raises(RecipeError, match=says), RunFolder(tmp_path / place).alone():
+            pytest.fail("it began")
+    assert tree_hash(tmp_path) == before
 
 
 @pytest.mark.parametrize("kind", [SweepFolder, ComparisonFolder])

@@ -86,7 +86,7 @@ def test_two_runs_of_one_network_are_told_apart_by_their_folders(
     ("words", "message"),
     [
         (["--only", "dust"], "--only dust.*noise, patch"),
-        (["--triples", "0"], "--triples 0"),
+        (["--triples", "0"], "--triples 0: use 1 or more"),
         (["--example", "5"], "0 to 4"),
     ],
 )
@@ -105,6 +105,16 @@ def test_a_study_replaces_nothing_of_others(dataset: str, run: Path, tmp_path: P
     with pytest.raises(RecipeError, match=message):
         study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / folder), "--triples", "1")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_named_twice_and_a_folder_in_a_dataset_are_refused(dataset: str, run: Path, tmp_path: Path) -> None:
+    checkpoint = run / "checkpoints" / "step-00000008"
+    with pytest.raises(RecipeError, match=rf"{run} and {checkpoint} are the same weights\. Name each once"):
+        study("robustness", str(run), str(checkpoint), "--data", dataset)
+    (tmp_path / "x.zarr").mkdir()
+    (tmp_path / "x.zarr" / "zarr.json").write_text("{}")
+    with pytest.raises(RecipeError, match="is the dataset"):
+        study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / "x.zarr" / "study"))
 
 
 def test_rows_of_other_weights_in_the_same_place_are_not_kept(dataset: str, run: Path, tmp_path: Path) -> None:

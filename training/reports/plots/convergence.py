@@ -121,7 +121,7 @@ def _draw_panel(axes: Axes, learned: Sequence[Learning], over: str) -> None:
         for one in learned:
             curve: RunCurve = getattr(one, kind)
             axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, color=colors[one.name], **style)
-    style_learning(axes)
+    style_learning(axes, steps=over == "steps")
     axes.set_xlabel("iteration" if over == "steps" else "seconds of training", fontsize=8, color=INK, labelpad=2)
     axes.set_ylabel("PMD (1e-4)" if over == "steps" else "", fontsize=8, color=INK, labelpad=2)
 

@@ -1,6 +1,7 @@
 """The grid of kinds as a heat map with numbers, and a picture of transfers between kinds (paper, Figure 8)."""
 
 import os
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from training.viz.style import DPI, INK, PAGE, ROLE_COLORS, saved, short
 _COLORS = colormaps["YlGnBu"]
 _NO_TRUTH = "#eceef1"
 _INCHES = 0.62  # a cell of the grid
+_LETTER = 0.068  # inches of a letter of the title
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ def heat_map(
         axes.set_title(short(name), fontsize=8.5, weight="bold", color=INK, pad=5, parse_math=False)
         axes.set_xlabel("target", fontsize=8, color=INK)
     every[0].set_ylabel("source", fontsize=8, color=INK)
-    figure.suptitle(title, fontsize=8.5, color=INK, x=0.01, ha="left", parse_math=False)
+    lines = textwrap.fill(title, int(width / _LETTER))
+    figure.suptitle(lines, fontsize=8.5, color=INK, x=0.01, ha="left", parse_math=False)
     return saved(figure, path)
 
 

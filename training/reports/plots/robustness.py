@@ -17,6 +17,7 @@ from training.viz.mesh_grid import Panel, Row, drawable, mesh_grid, standing
 from training.viz.style import DPI, INK, PAGE, QUIET, ROLE_COLORS, logarithmic, method_colors, saved, short, style_axes
 
 _ABREAST = 5
+_HANDLE, _LETTER = 0.55, 0.06  # inches in the legend
 _BODY_METRES = 1.7
 TAKES_EQUAL = "needs as many\nvertices as the target"
 
@@ -45,8 +46,10 @@ def robustness_curves(rows: Sequence[RobustnessRow], path: str | os.PathLike[str
         axes.set_ylabel("PMD (1e-4)", fontsize=7.5, color=INK)
     handles, names = grid[0, 0].get_legend_handles_labels()
     figure.suptitle(title, fontsize=9, weight="bold", color=INK, x=0.01, ha="left", parse_math=False)
-    place = {"loc": "outside lower left", "ncols": 7, "frameon": False}
-    legend = figure.legend(handles, [short(name) for name in names], fontsize=7.5, labelcolor=INK, **place)
+    names = [short(name) for name in names]
+    abreast = int(figure.get_figwidth() / (_HANDLE + _LETTER * max(map(len, names))))
+    place = {"loc": "outside lower left", "ncols": max(1, abreast), "frameon": False}
+    legend = figure.legend(handles, names, fontsize=7.5, labelcolor=INK, **place)
     for text in legend.get_texts():
         text.set_parse_math(False)  # methods are called after folders
     return saved(figure, path)

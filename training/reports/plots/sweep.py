@@ -76,7 +76,7 @@ def _draw_panel(axes: Axes, curves: Sequence[RunCurve], over: str, level: tuple[
         axes.plot(getattr(curve, over), curve.pmd / PMD_UNIT, marker="o", markersize=1.8 if rank else 3, **line)
     if level and level[1] <= max(curve.pmd.max() for curve in curves):
         dashed_level(axes, level[0], level[1] / PMD_UNIT, right=False)
-    style_learning(axes)
+    style_learning(axes, steps=over == "steps")
     axes.set_ylabel("PMD on unseen poses (1e-4)", fontsize=8, color=INK)
 
 

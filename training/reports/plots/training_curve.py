@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from datagen.common.arrays import Floats
 from training.tracking.journal import read_journal
@@ -55,6 +56,7 @@ def training_curve(
         place = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0.1}
         axes.legend(fontsize=7, frameon=False, ncols=6, labelcolor=INK, **place)
     all_axes[-1].set_xlabel("step", fontsize=8, color=INK)
+    all_axes[-1].xaxis.set_major_locator(MaxNLocator("auto", integer=True))
     return saved(figure, path)
 
 

@@ -105,12 +105,13 @@ function tick(now) {
   requestAnimationFrame(tick);
 }
 
-// Mean errors of an example as bars, shortest best; all examples share one scale.
+// Mean errors of an example as bars, the shortest in bold; all examples share one scale.
 function rank(example) {
+  const least = Math.min(...Object.values(example.errors).map((error) => error.mean));
   const all = data.examples.flatMap((one) => Object.values(one.errors).map((error) => error.mean));
   find("ranking").replaceChildren(...data.methods.filter(({ name }) => example.errors[name]).map(({ name, color }) => {
     const { mean } = example.errors[name];
-    const row = make("li", name === example.best ? "best" : "");
+    const row = make("li", mean === least && example.best ? "best" : "");
     const bar = make("i", "bar");
     bar.style.background = color;
     bar.style.width = `${Math.max((100 * mean) / Math.max(...all), 0.5)}%`;

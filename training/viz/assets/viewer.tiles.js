@@ -25,7 +25,7 @@ function heading({ kind, method }) {
   const dot = make("i", "dot");
   dot.style.background = data.methods.find(({ name }) => name === method)?.color;
   if (kind === "output" && data.methods.length > 1) title.prepend(dot);
-  title.append(make("small", "", small), make("small", "tag", "least error"));
+  title.append(make("small", "", small), make("small", "tag", "least PMD"));
   return title;
 }
 

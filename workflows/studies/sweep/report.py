@@ -140,7 +140,7 @@ def table(results: Sequence[TrialResult]) -> list[list[str]]:
                 *_ends(result.seen, with_step=False),
                 *(_reached(result.unseen, level[1]) if level else []),
                 f"{result.steps:,}",
-                f"{result.seconds:.0f}",
+                _seconds(result.seconds),
                 f"{result.meshes_per_second:.1f}" if result.seconds else "-",
                 result.state,
             ]
@@ -204,7 +204,11 @@ def _ends(curve: RunCurve, *, with_step: bool) -> list[str]:
 
 def _reached(curve: RunCurve, level: float) -> list[str]:
     first = curve.first_reached(level)
-    return [f"{first[0]:,.0f}", f"{first[1]:.0f}"] if first else ["-", "-"]
+    return [f"{first[0]:,.0f}", _seconds(first[1])] if first else ["-", "-"]
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.{1 if seconds < 10 else 0}f}"
 
 
 def _words(trial: Trial) -> str:

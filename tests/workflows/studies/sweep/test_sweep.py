@@ -255,6 +255,7 @@ def test_the_csv_has_each_trial_measured_from_its_own_journal(swept: Path) -> No
     assert rates == {"good": 0.003, "slow": 1e-6, "wild": 1e30}
     journal = read_journal(swept / "trials" / "good" / "metrics.jsonl")
     assert float(rows[0]["pmd_unseen"]) == journal[-1]["evaluation/pmd_unseen"] and rows[0]["steps"] == "8"
+    assert f" {float(rows[0]['seconds']):.1f} " in (swept / "sweep.md").read_text(), "not 0 s"
     assert float(rows[0]["seconds"]) == pytest.approx(sum(4 / row["meshes_per_second"] for row in journal))
     assert {float(row["twice_the_best"]) for row in rows} == {2 * float(rows[0]["pmd_unseen"])}
     assert [row["twice_the_best_step"] for row in rows] == ["4.0", "4.0", ""], (
