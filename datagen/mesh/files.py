@@ -118,8 +118,8 @@ def _read(path: Path, geometries: Sequence[str]) -> MeshFile:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Whatever is wrong with a file as MeshError, in one line."""
-    require_file(path)
     try:
+        require_file(path)
         refuse_huge(path)
         yield
     except MeshError:

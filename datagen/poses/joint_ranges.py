@@ -55,6 +55,7 @@ def _family(*, hip_spread: float, knee: float, wrist: float, left_ankle_x: Range
     )
 
 
+_TURN = 360
 NPT_FAMILIES: dict[str, tuple[Draw, ...]] = {
     "bent": _family(hip_spread=40, knee=100, wrist=20, left_ankle_x=(-10, 10)),
     "straight": _family(hip_spread=5, knee=10, wrist=10, left_ankle_x=(-10, 20)),
@@ -102,6 +103,17 @@ class RangeSource:
         self._seed = recipe.seed
         every = (-wanted.uniform, wanted.uniform)
         ranges = {joint: wanted.degrees.get(joint, (every, every, every)) for joint in self.joints}
+        for joint, axes in ranges.items():
+            if (largest := np.abs(axes).max()) > _TURN:
+                raise RecipeError(
+                    f"data.poses.distribution turns {joint!r} by up to {largest:g} degrees, more than a whole turn "
+                    f"({_TURN}). Set degrees or uniform to less"
+                )
+        if recipe.seen + recipe.unseen > 1 and not any(low < high for axes in ranges.values() for low, high in axes):
+            raise RecipeError(
+                "data.poses.distribution: `ranges` without a range makes all poses the same. Set uniform=DEGREES for "
+                "all joints of its skeleton, or degrees={JOINT: [[low, high], [low, high], [low, high]]} for some"
+            )
         self._draws = tuple(Draw((joint,), *axes) for joint, axes in ranges.items())
 
     def draw(self, pose: int) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from datagen.recipe.anny import AnnyBody
 from datagen.recipe.base import Frozen
 from datagen.recipe.bodies import Body
-from datagen.recipe.poses import Distribution, NptPoses, RangePoses
+from datagen.recipe.poses import Distribution, NptPoses
 
 
 class IdentityRecipe(Frozen):
@@ -31,15 +31,6 @@ class PoseRecipe(Frozen):
     unseen: int = Field(400, ge=0, description="poses kept for evaluation")
     distribution: Distribution = Field(default_factory=NptPoses, description="where poses come from")
     seed: int = Field(0, ge=0, description="seed of the pose draws")
-
-    @model_validator(mode="after")
-    def _differ(self) -> "PoseRecipe":
-        if isinstance(self.distribution, RangePoses) and not self.distribution.varies and self.seen + self.unseen > 1:
-            raise ValueError(
-                "distribution: `ranges` without a range makes all poses the same. Set uniform=DEGREES for all joints "
-                "of its skeleton, or degrees={JOINT: [[low, high], [low, high], [low, high]]} for some"
-            )
-        return self
 
 
 class EvaluationTriples(Frozen):

@@ -4,10 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from datagen.recipe.base import Frozen
-
-_Degrees = Annotated[float, Field(ge=-360, le=360)]
-_Turns = tuple[_Degrees, _Degrees]
+from datagen.recipe.base import Frozen, Range
 
 
 class NptPoses(Frozen):
@@ -25,21 +22,13 @@ class RangePoses(Frozen):
     """Uniform joint ranges of one's own, over any joint names."""
 
     name: Literal["ranges"] = "ranges"
-    degrees: dict[str, tuple[_Turns, _Turns, _Turns]] = Field(
+    degrees: dict[str, tuple[Range, Range, Range]] = Field(
         default_factory=dict, description="joint name -> ranges of the x, y, z axis-angle components in degrees"
     )
     uniform: float = Field(
-        0.0,
-        ge=0,
-        le=360,
-        description="every joint of `skeleton` without ranges of its own: all components within +- degrees",
+        0.0, ge=0, description="every joint of `skeleton` without ranges of its own: all components within +- degrees"
     )
     skeleton: Literal["smpl", "smal", "animals"] = Field("smpl", description="whose joint tree the names belong to")
-
-    @property
-    def varies(self) -> bool:
-        """Whether poses differ."""
-        return self.uniform > 0 or any(low != high for axes in self.degrees.values() for low, high in axes)
 
 
 class ClipPoses(Frozen):

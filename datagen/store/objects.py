@@ -71,8 +71,9 @@ class LocalObjects(LocalStore):
 
     def has_lost_root(self) -> bool:
         """Whether the folder holds a dataset, and nothing else, whose zarr.json is missing or no JSON."""
-        paths = [path for path in self.paths() if not path.startswith(".")]
-        if "manifest/zarr.json" not in paths or not all(is_member(path) or is_leftover(path) for path in paths):
+        if not (self.root / "manifest").is_dir():
+            return False
+        if not all(path.startswith(".") or is_member(path) or is_leftover(path) for path in self.paths()):
             return False
         try:
             return not isinstance(json.loads(self.read("zarr.json") or b""), dict)

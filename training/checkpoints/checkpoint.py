@@ -157,9 +157,9 @@ def load_checkpoint(run: Path, which: Which = "latest", *, weights_only: bool = 
         return load_checkpoint(run, "best", weights_only=weights_only) or newest
     path = best_of(run) if which == "best" else step_folder(run, f"step-{which:08d}")
     if isinstance(which, int) and path and not path.exists():
-        steps = [each.name.removeprefix("step-").lstrip("0") for each in newest_first(run)]
-        there = ", ".join(steps[::-1]) or "there is none"
-        raise CheckpointError(f"checkpoint {path} is not there. Name another step: {there}")
+        steps = sorted(int(each.name.removeprefix("step-")) for each in newest_first(run))
+        another = f"Name another step: {', '.join(map(str, steps))}" if steps else "There is none yet"
+        raise CheckpointError(f"checkpoint {path} is not there. {another}")
     return _named(path, weights_only=weights_only) if path else None
 
 

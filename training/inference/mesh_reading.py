@@ -3,9 +3,10 @@
 A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
 the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. Outputs of people
 that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
-a body is no difference. A transfer reads its meshes so, and what measures transfers of single meshes. Evaluations on
-datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body, in which pose
-an avatar is to be, or onto which parts an output is projected.
+a body is no difference. Filtered people, and people of points, are read twice, as they are and as their mirror images
+(animals' rigs are not alike on both sides). A transfer reads its meshes so, and what measures transfers of single
+meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is
+a body, in which pose an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence
@@ -134,7 +135,9 @@ def posed_targets(
                 for low_pass, output in zip(through, outputs, strict=True)]  # fmt: skip
         return torch.stack(rows)
 
-    twice = [chosen is not None or has_points(source) for chosen, source in zip(filters, sources, strict=True)]
+    of_people = network.joints == tuple(PEOPLE)
+    twice = [of_people and (chosen is not None or has_points(source))
+             for chosen, source in zip(filters, sources, strict=True)]  # fmt: skip
     return network.posed_target(
         stacked(network, vertices),
         read,

@@ -205,7 +205,7 @@ class Parts(nn.Module):
         ``heard`` gives of outputs [b, n, 3] what is to be read of them, in boxes of their own; by default as they are.
         ``twice`` says which sources and outputs [b] are read as their mirror images, too: what is read wrongly of a
         rough mesh is partly chance, and the mean of both has less of it. Without effect where no parts are called
-        left and right, as those of animals, whose rigs are not alike on both sides.
+        left and right.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):

@@ -83,7 +83,7 @@ def _reason(error: BaseException | None) -> str:
     while cause:
         if words := _NO_CONNECTION.get(type(cause)):
             return words
-        cause = cause.__cause__ or cause.__context__
+        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
     return _first_line(error) if error else ""
 
 

@@ -132,6 +132,7 @@ def append_command(options: argparse.Namespace) -> None:
       dsffnet append data/quickstart.zarr --evaluation-identities 12 --unseen-poses 400
     """
     from datagen.generate import append, grown_recipe
+    from workflows.pipeline.generate import is_complete
 
     given = vars(options)
     totals = {name: given[option.lstrip("-").replace("-", "_")] for option, (name, _) in _TOTALS.items()}
@@ -139,9 +140,10 @@ def append_command(options: argparse.Namespace) -> None:
         raise RecipeError(f"nothing to append: name at least one of {', '.join(_TOTALS)}")
     recipe = _own_recipe(options.out, options.set)
     grown = grown_recipe(options.out, recipe, totals)
+    nothing = grown == recipe and is_complete(options.out)
     with _runner(options, grown, anew=grown != recipe) as how:
         made = append(options.out, **totals, recipe=recipe, **how)
-    if grown == recipe:
+    if nothing:
         print_text(f"nothing was to be appended: {options.out} has these totals already")
     _show(made)
 

@@ -124,8 +124,9 @@ def _heed_signals() -> list[int]:
 
 
 def _require_text(words: Sequence[str]) -> None:
-    """Refuse empty words, which would mean this folder, and names that this shell's encoding lacks: Ray, MLflow and
-    records would write others.
+    """Refuse empty words, which would mean this folder, and names that this shell's encoding lacks.
+
+    Ray, MLflow and records would write others.
     """
     for option, word in pairwise(("the first word", *words)):
         if (not word and option != "--prefix") or (word != "--prefix=" and _EMPTY.fullmatch(word)):

@@ -300,8 +300,8 @@ def require_place(path: Path) -> None:
     """
     place = Path(os.path.realpath(path))
     for each in (place, *place.parents):
-        if each.is_file() or (each / "zarr.json").is_file():
-            what = "file" if each.is_file() else "dataset"
+        if (is_file := each.exists() and not each.is_dir()) or (each / "grid" / "zarr.json").is_file():
+            what = "file" if is_file else "dataset"
             raise RecipeError(f"{path} is the {what} {each}, or lies in it. Choose another --out, a folder of its own")
 
 

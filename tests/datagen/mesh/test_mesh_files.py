@@ -1,5 +1,6 @@
 """A person's mesh files across formats, and every way in which they can be wrong."""
 
+import errno
 import os
 import struct
 import subprocess
@@ -233,3 +234,15 @@ def test_a_file_of_another_whose_name_only_begins_alike_is_left_alone(tmp_path: 
     read = read_mesh_file(tmp_path / "from" / "person.obj")
     (said,) = write_posed(read, read.mesh.vertices, tmp_path / "p.obj").left_out
     assert said.startswith("person.mtl: another file") and (tmp_path / "person.mtl").read_text() == "of another body"
+
+
+def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "body.obj"
+    path.write_text("v 0 0 0\n")
+
+    def denied(*given: object, **named: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(MeshError, match=r"body\.obj cannot be read: Permission denied"):
+        read_mesh_file(path)

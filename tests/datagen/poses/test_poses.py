@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from datagen.common.errors import RecipeError
 from datagen.poses import JOINTS, PARENTS, Poses, draw_poses, load_poses
@@ -105,14 +104,15 @@ def test_a_range_of_an_unknown_joint_is_refused() -> None:
     [
         ({}, "makes all poses the same. Set uniform=DEGREES .* or degrees="),
         ({"degrees": {"head": ((5, 5), (0, 0), (0, 0))}}, "makes all poses the same"),
-        ({"uniform": 361}, "uniform"),
-        ({"degrees": {"head": ((0, 0), (-400, 0), (0, 0))}}, "degrees.head.1.0"),
+        ({"uniform": 361}, "turns 'pelvis' by up to 361 degrees"),
+        ({"degrees": {"head": ((0, 0), (-400, 0), (0, 0))}}, "turns 'head' by up to 400 degrees"),
     ],
 )
 def test_ranges_that_cannot_be_meant(distribution: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValidationError, match=f"(?s){says}"):
-        PoseRecipe.model_validate({"distribution": {"name": "ranges", **distribution}})
-    PoseRecipe.model_validate({"distribution": {"name": "ranges"}, "seen": 1, "unseen": 0})
+    """Where poses are drawn: a dataset that was made of such ranges can still be read."""
+    with pytest.raises(RecipeError, match=says):
+        load_poses(PoseRecipe.model_validate({"distribution": {"name": "ranges", **distribution}}))
+    load_poses(PoseRecipe.model_validate({"distribution": {"name": "ranges"}, "seen": 1, "unseen": 0}))
 
 
 def turned(joint: str, axis: int, degrees: float) -> Poses:

@@ -84,6 +84,9 @@ def test_points_and_what_is_filtered_are_read_twice(monkeypatch: pytest.MonkeyPa
     alone = [transferred(network, [source], [ball])[0] for source in sources]
     assert asked == [[False, True, True], None, [True], [True]]
     torch.testing.assert_close(together, torch.stack(alone), atol=1e-5, rtol=1e-4)
+    monkeypatch.setattr(network, "joints", (*PEOPLE, "left_wing", "right_wing"))
+    transferred(network, sources, [ball] * 3)
+    assert asked[-1] is None, "what is known of people need not hold for others"
 
 
 @pytest.mark.parametrize(("people", "left", "chosen"), [

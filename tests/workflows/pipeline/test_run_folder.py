@@ -85,8 +85,8 @@ def test_what_a_failed_run_leaves_is_removed_too(out: Path) -> None:
 
 def test_a_training_is_refused_in_a_workflow_a_dataset_and_a_file(tmp_path: Path) -> None:
     begin_record(tmp_path / "whole", name="mine", kind="workflow", parent=None, parameters={})
-    (tmp_path / "x.zarr").mkdir()
-    for file in ("x.zarr/zarr.json", "file"):
+    (tmp_path / "x.zarr" / "grid").mkdir(parents=True)
+    for file in ("x.zarr/grid/zarr.json", "file"):
         (tmp_path / file).write_text("{}")
     before = tree_hash(tmp_path)
     for place, says in (
