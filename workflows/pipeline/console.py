@@ -53,11 +53,11 @@ def guarded(main: Callable[[], None]) -> None:
         _require_text(sys.argv[1:])
         _flushed(main)
     except DsffnetError as error:
+        if told:  # so was what failed, as Ray's processes by `timeout`
+            _stop(told, str(error))
         _fail(str(error), error.exit_status)
     except KeyboardInterrupt as interrupt:
-        what_next = str(interrupt) or "run the same command again to resume"
-        print(f"{'stopped' if told else 'interrupted'}; {what_next}", file=sys.stderr)
-        sys.exit(128 + (told[0] if told else signal.SIGINT))
+        _stop(told, str(interrupt) or "run the same command again to resume")
     except UnicodeEncodeError as error:
         log.debug("as raised", exc_info=True)
         _fail(f"{error.object[:300]!r} is not UTF-8 text, which a name must be here. Rename it")
@@ -73,6 +73,11 @@ def guarded(main: Callable[[], None]) -> None:
             raise
         log.debug("as raised", exc_info=True)
         _fail(f"memory ran out ({reason_of(error)}). Nothing that was complete is lost; {_LESS}, and run again")
+
+
+def _stop(told: Sequence[int], what_next: str) -> NoReturn:
+    print(f"{'stopped' if told else 'interrupted'}; {what_next}", file=sys.stderr)
+    sys.exit(128 + (told[0] if told else signal.SIGINT))
 
 
 def _flushed(main: Callable[[], None]) -> None:

@@ -217,6 +217,8 @@ def _find(name_or_file: str) -> Path | dict[str, Any]:
         raise RecipeError(
             f"{name_or_file!r} is a recipe of training only. Add to another: --set training={name_or_file}"
         )
+    if os.path.exists(path):
+        raise RecipeError(f"{path} is no recipe, which is a file called .yaml, and no dataset, which is called .zarr")
     raise RecipeError(f"no recipe {name_or_file!r}{nearest(name_or_file, list(known))}; there are {', '.join(known)}")
 
 

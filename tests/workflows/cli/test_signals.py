@@ -100,6 +100,25 @@ def test_a_closed_terminal_ends_a_command_as_the_other_signals_do(
     assert capsys.readouterr().err == f"{words}; run the same command again to resume\n"
 
 
+def test_what_fails_as_all_are_told_to_stop_ends_with_the_status_of_the_signal() -> None:
+    """As Ray's processes do where a signal goes to the whole group."""
+    code = """
+import os, signal
+from datagen.common.errors import ClusterError
+from workflows.pipeline.console import guarded
+
+def main():
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        raise ClusterError("Ray's raylet has died")
+
+guarded(main)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (143, "stopped; Ray's raylet has died\n")
+
+
 @pytest.mark.parametrize("words", [["--help"], ["recipe"]])
 def test_a_pipe_that_is_read_no_more_ends_a_command_without_a_word(words: list[str]) -> None:
     reading, writing = os.pipe()

@@ -199,6 +199,9 @@ def test_early_stopping_needs_unseen_poses_to_go_by(key: str) -> None:
 
 
 def test_unknown_names_and_files(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(RecipeError, match=r"mine\.txt is no recipe, which is a file called \.yaml"):
+        load_recipe(str(tmp_path / "mine.txt"))
     with pytest.raises(RecipeError, match="no recipe 'quikstart', did you mean 'quickstart'"):
         load_recipe("quikstart")
     with pytest.raises(RecipeError, match=r"no recipe file .*mine\.yaml"):
