@@ -111,8 +111,8 @@ def test_a_run_named_twice_and_a_folder_in_a_dataset_are_refused(dataset: str, r
     checkpoint = run / "checkpoints" / "step-00000008"
     with pytest.raises(RecipeError, match=rf"{run} and {checkpoint} are the same weights\. Name each once"):
         study("robustness", str(run), str(checkpoint), "--data", dataset)
-    (tmp_path / "x.zarr").mkdir()
-    (tmp_path / "x.zarr" / "zarr.json").write_text("{}")
+    (tmp_path / "x.zarr" / "grid").mkdir(parents=True)
+    (tmp_path / "x.zarr" / "grid" / "zarr.json").write_text("{}")
     with pytest.raises(RecipeError, match="is the dataset"):
         study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / "x.zarr" / "study"))
 
