@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.mesh.low_pass import LowPass
+from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 from training.recipes.networks import PEOPLE
@@ -45,6 +46,8 @@ _STILL = 0.008
 """Root of the mean square over the vertices that are moved, half the longest edge of a mesh' box being 1, up to which a
 filter changes next to nothing: noise of 0.01 is moved by more.
 """
+_MOST_POINTS = 2 * MOST_SAMPLED
+"""Points that are read at most, as what they lack in faces more of them make up for (docs/results/parts.md)."""
 _NEIGHBOURS = 8
 """Of points, that are taken to be near them along the surface."""
 
@@ -135,15 +138,16 @@ def posed_targets(
                 for low_pass, output in zip(through, outputs, strict=True)]  # fmt: skip
         return torch.stack(rows)
 
-    of_people = network.joints == tuple(PEOPLE)
-    twice = [of_people and (chosen is not None or has_points(source))
-             for chosen, source in zip(filters, sources, strict=True)]  # fmt: skip
+    of_people, of_points = network.joints == tuple(PEOPLE), torch.tensor([has_points(source) for source in sources])
+    twice = of_people & (of_points | torch.tensor([chosen is not None for chosen in filters]))
+    most = torch.where(of_points, _MOST_POINTS, MOST_SAMPLED)
     return network.posed_target(
         stacked(network, vertices),
         read,
         surface,
         heard=heard if any(through) else None,
-        twice=torch.tensor(twice, device=device_of(network)) if any(twice) else None,
+        twice=twice.to(device_of(network)) if twice.any() else None,
+        most=most.to(device_of(network)) if of_points.any() else None,
     )
 
 

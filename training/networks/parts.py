@@ -43,6 +43,9 @@ _SURELY_CORRECTED = 0.1
 it was read (docs/results/parts.md).
 """
 
+_LEAST_NEAR = 0.07
+"""Share of a part's weight that lies near, along the surface, to each vertex that follows the part."""
+
 
 class Reading(NamedTuple):
     """What the network reads off meshes.
@@ -189,7 +192,7 @@ class Parts(nn.Module):
         with full_precision(target):
             drawn = sample(read, surface)
             logits, _, rotations, joints = self.read(drawn, read)
-            return ReadTarget(target, read, drawn, logits.softmax(2), rotations, joints)
+            return ReadTarget(target, read, drawn, _weights(logits, surface), rotations, joints)
 
     def posed_target(
         self,
@@ -199,17 +202,19 @@ class Parts(nn.Module):
         *,
         heard: Callable[[Tensor], Tensor] | None = None,
         twice: Tensor | None = None,
+        most: Tensor | None = None,
     ) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before.
 
         ``heard`` gives of outputs [b, n, 3] what is to be read of them, in boxes of their own; by default as they are.
         ``twice`` says which sources and outputs [b] are read as their mirror images, too: what is read wrongly of a
         rough mesh is partly chance, and the mean of both has less of it. Without effect where no parts are called
-        left and right.
+        left and right. ``most``: of the vertices of each source [b], how many are read at most; by default
+        `training.networks.layers.sampling.MOST_SAMPLED`.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
-            return self._corrected(sample(source, surface), target, heard, twice)
+            return self._corrected(sample(source, surface, most), target, heard, twice)
 
     def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
         """Return what is read off a sample's vertices, or off all [b, n, 3] of the meshes that it was drawn from."""
@@ -262,7 +267,7 @@ class Parts(nn.Module):
         """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return self.part(self._of_all(vertices, drawn, features, known)).softmax(2)
+        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn.surface)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -429,6 +434,21 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     mean = masses[:, None] @ outputs
     variance = (masses[:, None] @ outputs.square() - mean.square()).clamp_min(0)
     return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
+
+
+def _weights(logits: Tensor, surface: Surface | None) -> Tensor:
+    """Skinning weights [b, n, part] of all vertices, none of a part that is not near along the surface.
+
+    A few vertices of a back that are taken for an upper arm's would fly away with it.
+    """
+    weights = logits.softmax(2)
+    if surface is None:
+        return weights
+    cells = surface.cells[..., None].expand_as(weights)
+    held = weights.new_zeros(*surface.near.shape[:2], weights.shape[2]).scatter_add(1, cells, weights)
+    is_near = surface.near.to(held.dtype) @ held >= _LEAST_NEAR * held.sum(1, keepdim=True)
+    is_near = is_near | ~is_near.any(2, keepdim=True)
+    return logits.masked_fill(~is_near.gather(1, cells), -torch.inf).softmax(2)
 
 
 class _Moments(NamedTuple):

@@ -10,6 +10,7 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.low_pass import LowPass
 from tests.support.shapes.avatars import noisy, sphere
 from tests.support.three_networks import lively
+from training.inference import mesh_reading
 from training.inference.mesh_reading import (
     posed_targets,
     read_targets,
@@ -18,6 +19,7 @@ from training.inference.mesh_reading import (
     transferred,
 )
 from training.networks import parts
+from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.parts import Parts
 from training.recipes.networks import PEOPLE
 
@@ -87,6 +89,18 @@ def test_points_and_what_is_filtered_are_read_twice(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(network, "joints", (*PEOPLE, "left_wing", "right_wing"))
     transferred(network, sources, [ball] * 3)
     assert asked[-1] is None, "what is known of people need not hold for others"
+
+
+def test_more_points_are_read_than_vertices_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each by itself: what else is in a batch changes nothing."""
+    network, ball = lively("parts").eval(), noisy(sphere(subdivisions=4), 0.003)
+    sources = [ball, Mesh(ball.vertices[::-1], NO_FACES)]
+    together = transferred(network, sources, [ball] * 2)
+    mesh, points = (transferred(network, [source], [ball])[0] for source in sources)
+    torch.testing.assert_close(together, torch.stack([mesh, points]), atol=1e-5, rtol=1e-4)
+    monkeypatch.setattr(mesh_reading, "_MOST_POINTS", MOST_SAMPLED)
+    assert torch.equal(transferred(network, sources[:1], [ball])[0], mesh)
+    assert (transferred(network, sources[1:], [ball])[0] - points).abs().max() > 1e-4, "else this shows nothing"
 
 
 @pytest.mark.parametrize(("people", "left", "chosen"), [

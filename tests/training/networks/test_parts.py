@@ -76,6 +76,18 @@ def test_a_sample_holds_every_region_once() -> None:
     assert torch.cdist(vertices[0, ::50], kept).min(1).values.max() < 0.11
 
 
+def test_meshes_of_a_batch_have_samples_of_as_many_vertices_as_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices = sphere(1500, upper=0.5).expand(2, -1, -1)
+    drawn = sample(vertices, most=torch.tensor([100, 1100]))
+    for of_both, most in zip(range(2), (100, 1100), strict=True):
+        monkeypatch.setattr(sampling, "MOST_SAMPLED", most)
+        alone, counts = sample(vertices[:1]), drawn.masses[of_both] > 0
+        assert counts.sum() == most == len(alone.rows[0])
+        assert torch.equal(drawn.rows[of_both][counts], alone.rows[0])
+        torch.testing.assert_close(drawn.masses[of_both][counts], alone.masses[0])
+        torch.testing.assert_close(drawn.around.offsets[of_both][counts], alone.around.offsets[0], atol=1e-5, rtol=1e-4)
+
+
 def test_offsets_point_out_of_the_surface_however_dense_it_is() -> None:
     for count in (600, 20_000):
         vertices = sphere(count, upper=0.8)

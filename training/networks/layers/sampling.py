@@ -25,7 +25,7 @@ than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 MOST_SAMPLED = 1024
-"""Vertices of a mesh that are sampled at most."""
+"""Vertices of a mesh that are sampled at most, where nothing else is said."""
 _AT_ONCE, _REGION = 512, 0.25
 """So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
 longest edge of a mesh' box being 1."""
@@ -138,9 +138,12 @@ def vertex_masses(vertices: Tensor) -> Tensor:
     return 1 / near / (1 / near).sum(dim=1, keepdim=True) + broken
 
 
-def sample(vertices: Tensor, surface: Surface | None = None) -> Sample:
-    """Return 1,024 vertices [b, k, 3] of meshes [b, n, 3] or fewer, whatever the vertices' order (but for ties)."""
-    rows, chosen = _thinned(vertices.detach(), surface)
+def sample(vertices: Tensor, surface: Surface | None = None, most: Tensor | None = None) -> Sample:
+    """Return some vertices [b, k, 3] of meshes [b, n, 3], whatever the vertices' order (but for ties).
+
+    ``most``: how many at most of each mesh [b]; by default `MOST_SAMPLED`.
+    """
+    rows, chosen = _thinned(vertices.detach(), surface, most)
     apart = None if surface is None else surface.apart(rows)
     drawn = _with_masses(rows, taken(vertices, rows), chosen, surface, apart)
     broken = vertices.detach().sum((1, 2), keepdim=True) * 0  # not a number where one is, in the sample or not
@@ -154,7 +157,7 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]:
+def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
     Of more cells than the sample takes, those are taken whose vertex is nearest to the middle: on a body they lie more
@@ -174,10 +177,14 @@ def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]
     first = torch.ones_like(ordered, dtype=torch.bool)
     first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
     off = off.gather(1, order)
+    limit = MOST_SAMPLED if most is None else int(most.amax())
     # of a min() torch.export would understand less
-    count = vertices.shape[1] if vertices.shape[1] <= MOST_SAMPLED else MOST_SAMPLED
+    count = vertices.shape[1] if vertices.shape[1] <= limit else limit
     kept = torch.where(first, -off, -9.0).topk(count, dim=1)
-    return order.gather(1, kept.indices), kept.values > -9
+    chosen = kept.values > -9
+    if most is not None:
+        chosen = chosen & (torch.arange(count, device=most.device) < most[:, None])
+    return order.gather(1, kept.indices), chosen
 
 
 def _with_masses(

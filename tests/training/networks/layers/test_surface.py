@@ -9,6 +9,7 @@ from datagen.mesh.geometry import Mesh, edges_of
 from tests.support.shapes.samples import offsets_of
 from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
+from training.networks import parts
 from training.networks.layers import sampling
 from training.networks.layers.sampling import sample
 from training.networks.layers.surface import Surface, joined, of_cells, surface_of
@@ -197,3 +198,25 @@ def test_crumbs_are_one_cell_that_is_near_to_all() -> None:
     assert near(Mesh(vertices, faces))[len(mesh.vertices) :].all()
     found = near(Mesh(vertices, faces))[: len(mesh.vertices), : len(mesh.vertices)]
     assert (found == near(mesh)).all()
+
+
+@pytest.mark.parametrize("joined_at_the_end", [True, False])
+def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it(joined_at_the_end: bool) -> None:
+    """Two strips that touch, one part each: the parts' shares of a few vertices are exchanged."""
+    mesh = hairpin(joined_at_the_end=joined_at_the_end)
+    half, few = len(mesh.vertices) // 2, slice(3, 6)
+    logits = torch.tensor([4.0, 0.0, 2.0]).repeat(2 * half, 1)
+    logits[half:] = logits[half:, [1, 0, 2]]
+    logits[few] = logits[few][:, [1, 0, 2]]
+    surface = surface_of(mesh.vertices, edges_of(mesh.faces))
+    weights, as_read = parts._weights(logits[None], surface)[0], logits.softmax(1)
+    assert torch.equal(parts._weights(logits[None], None)[0], as_read)
+    if not joined_at_the_end:
+        assert torch.equal(weights, as_read), "what no edge joins may be of one part"
+        return
+    assert as_read[few].argmax(1).eq(1).all() and weights[few].argmax(1).eq(2).all() and weights[few, 1].eq(0).all()
+    torch.testing.assert_close(weights.sum(1), torch.ones(2 * half))
+    others = torch.tensor([vertex for vertex in range(half) if vertex not in range(*few.indices(half))])
+    assert weights[others].argmax(1).eq(0).all() and weights[half:].argmax(1).eq(1).all()
+    nowhere = torch.full_like(logits, -9.0).scatter(1, torch.arange(2 * half)[:, None] % 3, 9.0)
+    assert parts._weights(nowhere[None], surface).isfinite().all()
