@@ -78,6 +78,12 @@ def has_points(mesh: Mesh) -> bool:
     return not _in_faces(mesh).all()
 
 
+def lists_alike(one: Mesh, other: Mesh) -> bool:
+    """Whether two meshes list the same vertices in the same order, as their faces tell."""
+    alike = len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
+    return alike and not has_points(one)
+
+
 def device_of(network: nn.Module) -> torch.device:
     """Where a network's weights are."""
     return next((weight.device for weight in network.parameters()), torch.device("cpu"))
@@ -124,9 +130,12 @@ def posed_targets(
 ) -> Tensor:
     """Return targets [b, n, 3] that were ``read``, in the poses of as many sources, in boxes of their own.
 
-    ``surface``: of the sources, where it is known.
+    Sources that list the target's vertices in its order are read at the same ones. ``surface``: of the sources, where
+    it is known.
     """
-    surface = surface or surface_of_meshes(sources).to(device_of(network))
+    alike = torch.tensor([lists_alike(*both) for both in zip(sources, targets, strict=True)])
+    if surface is None and not alike.all():
+        surface = surface_of_meshes(sources).to(device_of(network))
     vertices, filters = zip(*(_as_read(network, mesh) for mesh in sources), strict=True)
     through = [LowPass(target.faces, len(target.vertices)) if _is_heard(chosen, source, target) else None
                for chosen, source, target in zip(filters, sources, targets, strict=True)]  # fmt: skip
@@ -148,6 +157,7 @@ def posed_targets(
         heard=heard if any(through) else None,
         twice=twice.to(device_of(network)) if twice.any() else None,
         most=most.to(device_of(network)) if of_points.any() else None,
+        alike=alike.to(device_of(network)) if alike.any() else None,
     )
 
 

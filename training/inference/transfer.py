@@ -21,7 +21,7 @@ from datagen.common.arrays import Floats
 from datagen.mesh.geometry import InFaces, Mesh, bounding_box, check_mesh, standing_point
 from training.inference.mesh_reading import (
     device_of,
-    has_points,
+    lists_alike,
     posed_targets,
     read_targets,
     stacked,
@@ -184,7 +184,7 @@ class PoseTransfer:
     def _poser(self, target: Mesh) -> Callable[[Mesh], NDArray[np.float64]]:
         """Return what poses the target as sources are, unplaced.
 
-        What is read of the target alone, and what is near along the surface of sources that list the same faces, is
+        What is read of the target alone, and what is near along the surface of sources that list the same vertices, is
         found once.
         """
         network = self._network
@@ -198,7 +198,7 @@ class PoseTransfer:
 
         def posed(source: Mesh) -> NDArray[np.float64]:
             nonlocal first, surface
-            if first is None or not _is_same_mesh(source, first):
+            if not lists_alike(source, target) and (first is None or not lists_alike(source, first)):
                 first, surface = source, surface_of_meshes([source]).to(self._device)
             with products("float32"):
                 return posed_targets(network, [source], [target], read, surface)[0].double().cpu().numpy()
@@ -265,11 +265,6 @@ class PoseTransfer:
 def _as_told(axes: Stands) -> Stands:
     """How a mesh stands without what was read of a root, which may have been another mesh's."""
     return replace(axes, root=None) if isinstance(axes, Standing) else axes
-
-
-def _is_same_mesh(one: Mesh, other: Mesh) -> bool:
-    alike = len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
-    return alike and not has_points(one)
 
 
 @dataclass(frozen=True)

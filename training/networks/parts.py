@@ -203,6 +203,7 @@ class Parts(nn.Module):
         heard: Callable[[Tensor], Tensor] | None = None,
         twice: Tensor | None = None,
         most: Tensor | None = None,
+        alike: Tensor | None = None,
     ) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before.
 
@@ -211,10 +212,19 @@ class Parts(nn.Module):
         rough mesh is partly chance, and the mean of both has less of it. Without effect where no parts are called
         left and right. ``most``: of the vertices of each source [b], how many are read at most; by default
         `training.networks.layers.sampling.MOST_SAMPLED`.
+        ``alike`` says which sources [b] list the target's vertices in the target's order. They are read at the vertices
+        at which the target and the output are, so that more of the errors cancel; of surfaces the target's counts.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
-            return self._corrected(sample(source, surface, most), target, heard, twice)
+            if alike is None or not bool(alike.any()):
+                return self._corrected(self._rotations(sample(source, surface, most), twice), target, heard, twice)
+            drawn = target.drawn
+            wanted = self._rotations(drawn.moved(taken(source, drawn.rows)), twice)
+            if not bool(alike.all()):
+                of_others = self._rotations(sample(source, surface, most), twice)
+                wanted = torch.where(alike[:, None, None, None], wanted, of_others)
+            return self._corrected(wanted, target, heard, twice)
 
     def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
         """Return what is read off a sample's vertices, or off all [b, n, 3] of the meshes that it was drawn from."""
@@ -301,12 +311,11 @@ class Parts(nn.Module):
 
     def _corrected(
         self,
-        source: Sample,
+        wanted: Tensor,
         target: ReadTarget,
         heard: Callable[[Tensor], Tensor] | None = None,
         twice: Tensor | None = None,
     ) -> Tensor:
-        wanted = self._rotations(source, twice)
         vertices, as_read, drawn, weights, own, joints = target
         turns = wanted @ own.mT
 

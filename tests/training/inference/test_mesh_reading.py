@@ -19,7 +19,7 @@ from training.inference.mesh_reading import (
     transferred,
 )
 from training.networks import parts
-from training.networks.layers.sampling import MOST_SAMPLED
+from training.networks.layers.sampling import MOST_SAMPLED, Sample
 from training.networks.parts import Parts
 from training.recipes.networks import PEOPLE
 
@@ -61,10 +61,10 @@ def test_what_a_person_is_read_through_the_output_is_read_through(
     def heard(outputs: torch.Tensor) -> torch.Tensor:
         return stacked(network, [LowPass(target.faces, len(target.vertices))(outputs[0].numpy(), 8)])
 
-    twice = torch.tensor([True])
+    named = {"twice": torch.tensor([True]), "alike": torch.tensor([subdivisions == of_target])}
     with torch.no_grad():
-        expected = network.posed_target(filtered, read, surface, heard=heard if both else None, twice=twice)
-        otherwise = network.posed_target(filtered, read, surface, heard=None if both else heard, twice=twice)
+        expected = network.posed_target(filtered, read, surface, heard=heard if both else None, **named)
+        otherwise = network.posed_target(filtered, read, surface, heard=None if both else heard, **named)
     posed = posed_targets(network, [source], [target], read)
     torch.testing.assert_close(posed, expected, rtol=0, atol=1e-5)
     assert surely == 0 or (posed - otherwise).abs().max() > 1e-4
@@ -89,6 +89,27 @@ def test_points_and_what_is_filtered_are_read_twice(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(network, "joints", (*PEOPLE, "left_wing", "right_wing"))
     transferred(network, sources, [ball] * 3)
     assert asked[-1] is None, "what is known of people need not hold for others"
+
+
+def test_a_source_that_lists_the_targets_vertices_is_read_where_the_target_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each by itself: what else is in a batch changes nothing."""
+    network, ball = lively("parts").eval(), noisy(sphere(subdivisions=4), 0.003)
+    moved = Mesh(noisy(sphere(subdivisions=4), 0.002).vertices * [1.0, 1.3, 0.8], ball.faces)
+    sources = [moved, Mesh(moved.vertices, moved.faces[::-1]), Mesh(moved.vertices, NO_FACES)]
+    read, asked, real = read_targets(network, [ball] * 3), list[torch.Tensor](), Parts._rotations
+
+    def rotations(self: Parts, drawn: Sample, twice: torch.Tensor | None) -> torch.Tensor:
+        asked.append(drawn.rows)
+        return real(self, drawn, twice)
+
+    monkeypatch.setattr(Parts, "_rotations", rotations)
+    together = transferred(network, sources, [ball] * 3)
+    assert torch.equal(asked[0], read.drawn.rows)
+    for number, source in enumerate(sources):
+        asked.clear()
+        alone = transferred(network, [source], [ball])[0]
+        assert torch.equal(asked[0], read.drawn.rows[:1]) == (number == 0)
+        torch.testing.assert_close(together[number], alone, atol=1e-5, rtol=1e-4)
 
 
 def test_more_points_are_read_than_vertices_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
