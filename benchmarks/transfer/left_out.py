@@ -54,9 +54,7 @@ def main() -> None:
         print(f"| {name} | {np.mean(errors):.1f} ({np.median(errors):.1f}) | {np.mean(kept):.0f} | {share:.2f} |")
 
 
-def drawn(
-    dataset: Dataset, random: np.random.Generator, sources: list[int], targets: list[int], number: int
-) -> Case:
+def drawn(dataset: Dataset, random: np.random.Generator, sources: list[int], targets: list[int], number: int) -> Case:
     """A transfer from one of the sources onto another of the targets, in two unseen poses."""
     source = int(random.choice(sources))
     target = int(random.choice([one for one in targets if one != source]))
