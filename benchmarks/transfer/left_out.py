@@ -30,14 +30,14 @@ def main() -> None:
     parser.add_argument("kind", help="a name as in the dataset's body: alpaca, fox")
     options = parser.parse_args()
     dataset, network = open_dataset(options.dataset), load_trained(options.run)[0].eval()
-    names = [asset["name"].removesuffix(".glb") for asset in dataset.attributes["body"]["assets"]]
+    names = [asset["name"].removesuffix(".glb") for asset in dataset.attributes["body"].get("assets", [])]
     if options.kind not in names:
-        parser.error(f"{options.dataset} has no {options.kind!r}, but {', '.join(names)}")
+        parser.error(f"{options.dataset} has no {options.kind!r}, but {', '.join(names) or 'bodies without kinds'}")
     new = dataset.identities("evaluation")
     left = [one for one in new if dataset.parameters(one)[0] == names.index(options.kind)]
-    if len(left) < 2:
-        parser.error(f"{options.dataset} has {len(left)} draws of {options.kind} to evaluate: 2 are needed")
     known = [one for one in new if one not in left]
+    if min(len(left), len(known), len(dataset.grid.poses("unseen"))) < 2:
+        parser.error(f"{options.dataset} needs two new {options.kind}s, two other animals and two unseen poses or more")
     print("| source > target | left out | target unchanged | share |\n|---|---:|---:|---:|")
     random = np.random.default_rng(0)
     for name, sources, targets in (
@@ -58,7 +58,7 @@ def drawn(dataset: Dataset, random: np.random.Generator, sources: list[int], tar
     """A transfer from one of the sources onto another of the targets, in two unseen poses."""
     source = int(random.choice(sources))
     target = int(random.choice([one for one in targets if one != source]))
-    unseen = dataset.recipe.poses.seen + random.choice(dataset.recipe.poses.unseen, 2, replace=False)
+    unseen = random.choice(dataset.grid.poses("unseen"), 2, replace=False)
     return case_of(dataset, number, (source, int(unseen[0]), target, int(unseen[1])))
 
 

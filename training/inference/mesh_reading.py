@@ -4,7 +4,8 @@ A parts network poses the vertices of a mesh as they are, but may read them othe
 the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. Outputs of people
 that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
 a body is no difference. Filtered people, and people of points, are read twice, as they are and as their mirror images
-(animals' rigs are not alike on both sides). A transfer reads its meshes so, and what measures transfers of single
+(animals' rigs are not alike on both sides), of points more than of vertices. Sources that list the vertices of their
+targets are read at the same ones. A transfer reads its meshes so, and what measures transfers of single
 meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is
 a body, in which pose an avatar is to be, or onto which parts an output is projected.
 """
@@ -48,6 +49,10 @@ filter changes next to nothing: noise of 0.01 is moved by more.
 """
 _MOST_POINTS = 2 * MOST_SAMPLED
 """Points that are read at most, as what they lack in faces more of them make up for (docs/results/parts.md)."""
+_SHARED = 3
+"""Corners of faces for one vertex at least, where faces tell which vertices are listed: triangle soups have one, soups
+of quads one and a half, closed meshes six.
+"""
 _NEIGHBOURS = 8
 """Of points, that are taken to be near them along the surface."""
 
@@ -79,9 +84,12 @@ def has_points(mesh: Mesh) -> bool:
 
 
 def lists_alike(one: Mesh, other: Mesh) -> bool:
-    """Whether two meshes list the same vertices in the same order, as their faces tell."""
+    """Whether two meshes list the same vertices in the same order, as their faces tell.
+
+    Not where most faces list vertices of their own, as unwelded ones do: 0, 1, 2, then 3, 4, 5, whatever these are.
+    """
     alike = len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
-    return alike and not has_points(one)
+    return alike and np.size(one.faces) >= _SHARED * len(one.vertices) and not has_points(one)
 
 
 def device_of(network: nn.Module) -> torch.device:
@@ -156,8 +164,8 @@ def posed_targets(
         surface,
         heard=heard if any(through) else None,
         twice=twice.to(device_of(network)) if twice.any() else None,
-        most=most.to(device_of(network)) if of_points.any() else None,
-        alike=alike.to(device_of(network)) if alike.any() else None,
+        most=most if of_points.any() else None,
+        alike=alike if alike.any() else None,
     )
 
 

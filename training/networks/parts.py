@@ -192,7 +192,7 @@ class Parts(nn.Module):
         with full_precision(target):
             drawn = sample(read, surface)
             logits, _, rotations, joints = self.read(drawn, read)
-            return ReadTarget(target, read, drawn, _weights(logits, surface), rotations, joints)
+            return ReadTarget(target, read, drawn, _weights(logits, drawn), rotations, joints)
 
     def posed_target(
         self,
@@ -210,20 +210,21 @@ class Parts(nn.Module):
         ``heard`` gives of outputs [b, n, 3] what is to be read of them, in boxes of their own; by default as they are.
         ``twice`` says which sources and outputs [b] are read as their mirror images, too: what is read wrongly of a
         rough mesh is partly chance, and the mean of both has less of it. Without effect where no parts are called
-        left and right. ``most``: of the vertices of each source [b], how many are read at most; by default
-        `training.networks.layers.sampling.MOST_SAMPLED`.
-        ``alike`` says which sources [b] list the target's vertices in the target's order. They are read at the vertices
-        at which the target and the output are, so that more of the errors cancel; of surfaces the target's counts.
+        left and right. ``alike`` says which sources [b] list the target's vertices in the target's order.
+        They are read at the vertices at which the target and the output are, so that more of the errors cancel; of
+        surfaces the target's counts. ``most``: of the vertices of each other source [b], how many are read at most; by
+        default `training.networks.layers.sampling.MOST_SAMPLED`. Both are asked on the CPU.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
             if alike is None or not bool(alike.any()):
                 return self._corrected(self._rotations(sample(source, surface, most), twice), target, heard, twice)
             drawn = target.drawn
-            wanted = self._rotations(drawn.moved(taken(source, drawn.rows)), twice)
+            broken = source.sum((1, 2)) * 0  # not a number where one is, in the sample or not
+            wanted = self._rotations(drawn.moved(taken(source, drawn.rows)), twice) + broken[:, None, None, None]
             if not bool(alike.all()):
                 of_others = self._rotations(sample(source, surface, most), twice)
-                wanted = torch.where(alike[:, None, None, None], wanted, of_others)
+                wanted = torch.where(alike.to(source.device)[:, None, None, None], wanted, of_others)
             return self._corrected(wanted, target, heard, twice)
 
     def read(self, drawn: Sample, vertices: Tensor | None = None) -> Reading:
@@ -277,7 +278,7 @@ class Parts(nn.Module):
         """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn.surface)
+        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -445,19 +446,21 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
 
 
-def _weights(logits: Tensor, surface: Surface | None) -> Tensor:
-    """Skinning weights [b, n, part] of all vertices, none of a part that is not near along the surface.
+def _weights(logits: Tensor, drawn: Sample) -> Tensor:
+    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near.
 
-    A few vertices of a back that are taken for an upper arm's would fly away with it.
+    A few vertices of a back that are taken for an upper arm's would fly away with it. How much of a part is near along
+    the surface is told by the masses of the sample, however finely the mesh is meshed there.
     """
-    weights = logits.softmax(2)
+    weights, surface = logits.softmax(2), drawn.surface
     if surface is None:
         return weights
-    cells = surface.cells[..., None].expand_as(weights)
-    held = weights.new_zeros(*surface.near.shape[:2], weights.shape[2]).scatter_add(1, cells, weights)
+    shares = taken(weights, drawn.rows) * drawn.masses[..., None]
+    cells = surface.cells.gather(1, drawn.rows)[..., None].expand_as(shares)
+    held = weights.new_zeros(*surface.near.shape[:2], weights.shape[2]).scatter_add(1, cells, shares)
     is_near = surface.near.to(held.dtype) @ held >= _LEAST_NEAR * held.sum(1, keepdim=True)
     is_near = is_near | ~is_near.any(2, keepdim=True)
-    return logits.masked_fill(~is_near.gather(1, cells), -torch.inf).softmax(2)
+    return logits.masked_fill(~is_near.gather(1, surface.cells[..., None].expand_as(weights)), -torch.inf).softmax(2)
 
 
 class _Moments(NamedTuple):

@@ -12,6 +12,7 @@ from tests.support.shapes.avatars import noisy, sphere
 from tests.support.three_networks import lively
 from training.inference import mesh_reading
 from training.inference.mesh_reading import (
+    lists_alike,
     posed_targets,
     read_targets,
     stacked,
@@ -112,10 +113,25 @@ def test_a_source_that_lists_the_targets_vertices_is_read_where_the_target_is(mo
         torch.testing.assert_close(together[number], alone, atol=1e-5, rtol=1e-4)
 
 
+def test_unwelded_meshes_do_not_tell_by_their_faces_which_vertices_they_list() -> None:
+    ball = sphere(subdivisions=3)
+    quads = np.arange(4 * len(ball.faces)).reshape(-1, 4)
+    for corners, faces in (
+        (ball.faces, np.arange(3 * len(ball.faces)).reshape(-1, 3)),
+        (ball.faces[:, [0, 1, 2, 2]], np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])),
+    ):
+        soup, other = (Mesh(ball.vertices[order].reshape(-1, 3), faces) for order in (corners, corners[::-1]))
+        assert not lists_alike(soup, other) and not lists_alike(soup, soup)
+    assert lists_alike(ball, noisy(ball, 0.1)) and not lists_alike(ball, Mesh(ball.vertices, ball.faces[:, ::-1]))
+    assert not lists_alike(ball, sphere(subdivisions=2)) and lists_alike(*[Mesh(ball.vertices, ball.faces[:-3])] * 2)
+    loose = Mesh(np.concatenate([ball.vertices, ball.vertices[:1]]), ball.faces)
+    assert not lists_alike(loose, loose) and not lists_alike(*[Mesh(ball.vertices, NO_FACES)] * 2)
+
+
 def test_more_points_are_read_than_vertices_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each by itself: what else is in a batch changes nothing."""
     network, ball = lively("parts").eval(), noisy(sphere(subdivisions=4), 0.003)
-    sources = [ball, Mesh(ball.vertices[::-1], NO_FACES)]
+    sources = [Mesh(ball.vertices, ball.faces[::-1]), Mesh(ball.vertices[::-1], NO_FACES)]
     together = transferred(network, sources, [ball] * 2)
     mesh, points = (transferred(network, [source], [ball])[0] for source in sources)
     torch.testing.assert_close(together, torch.stack([mesh, points]), atol=1e-5, rtol=1e-4)

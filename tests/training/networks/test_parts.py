@@ -150,8 +150,8 @@ def test_a_correction_is_read_only_where_it_may_be_worse(
     network = lively("parts").eval()
     assert isinstance(network, Parts)
     monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
-    source, target = sample(meshes(300, seed=1)), network.read_target(meshes(200, seed=2))
-    wanted = network.read(source).rotations
+    source, target = meshes(300, seed=1), network.read_target(meshes(200, seed=2))
+    wanted = network.read(sample(source)).rotations
     turns, missing, outputs = [wanted @ target.rotations.mT], [], []
     for _ in range(2):
         outputs.append(network.posed(target.vertices, target.weights, target.joints, turns[-1]))
@@ -161,7 +161,7 @@ def test_a_correction_is_read_only_where_it_may_be_worse(
     better = (missing[1] <= missing[0]) | (missing[0] <= surely)
     asked, real = list[int](), network.read
     monkeypatch.setattr(network, "read", lambda drawn: asked.append(1) or real(drawn))
-    posed = network._corrected(source, target)
+    posed = network.posed_target(source, target)
     torch.testing.assert_close(posed, torch.where(better[:, None, None], outputs[1], outputs[0]), rtol=0, atol=1e-6)
     assert len(asked) == reads
 
@@ -175,7 +175,7 @@ def test_what_is_surely_corrected_is_so_in_any_company(monkeypatch: pytest.Monke
     for surely in (0.0, 1e9):
         monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
         each = zip(source.split(1), target.split(1), strict=True)
-        alone.append(torch.cat([network._corrected(sample(one), network.read_target(other)) for one, other in each]))
+        alone.append(torch.cat([network.posed_target(one, network.read_target(other)) for one, other in each]))
     judged, taken_unread = alone
     refused = (judged - taken_unread).abs().amax((1, 2)) > 1e-5
     assert refused.any() and not refused.all(), "else this shows nothing"
@@ -185,7 +185,7 @@ def test_what_is_surely_corrected_is_so_in_any_company(monkeypatch: pytest.Monke
     missing = (wanted - found).square().sum((1, 2, 3))
     surely = float(missing[refused].min())  # the first that is refused where it is read is taken unread
     monkeypatch.setattr(parts, "_SURELY_CORRECTED", surely)
-    together = network._corrected(sample(source), reads)
+    together = network.posed_target(source, reads)
     expected = torch.where((missing <= surely)[:, None, None], taken_unread, judged)
     torch.testing.assert_close(together, expected, rtol=0, atol=1e-5)
 
@@ -247,6 +247,11 @@ def test_a_vertex_that_is_no_number_spoils_its_pair_even_where_the_sample_leaves
     source[0, 1] = 0.001  # where the broken one is taken to be
     output = network(source=source, target=meshes(30, seed=6))
     assert output[0].isnan().all() and output[1].isfinite().all()
+    with torch.no_grad():
+        target = network.read_target(meshes(3000, seed=5))
+        assert not (target.drawn.rows[0] == 0).any(), "else this shows nothing"
+        posed = network.posed_target(source, target, alike=torch.tensor([True, True]))
+    assert posed[0].isnan().all() and posed[1].isfinite().all()
 
 
 def test_rotations_about_vectors_and_those_found_from_points_are_scipys() -> None:

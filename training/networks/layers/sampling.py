@@ -141,7 +141,7 @@ def vertex_masses(vertices: Tensor) -> Tensor:
 def sample(vertices: Tensor, surface: Surface | None = None, most: Tensor | None = None) -> Sample:
     """Return some vertices [b, k, 3] of meshes [b, n, 3], whatever the vertices' order (but for ties).
 
-    ``most``: how many at most of each mesh [b]; by default `MOST_SAMPLED`.
+    ``most``: how many at most of each mesh [b], on the CPU; by default `MOST_SAMPLED`.
     """
     rows, chosen = _thinned(vertices.detach(), surface, most)
     apart = None if surface is None else surface.apart(rows)
@@ -160,7 +160,7 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
-    Of more cells than the sample takes, those are taken whose vertex is nearest to the middle: on a body they lie more
+    Of more cells than the sample takes (``most`` [b], or `MOST_SAMPLED`), those are taken whose vertex is nearest to the middle: on a body they lie more
     evenly than a draw (docs/results/parts.md), but flat faces along the grid may be left out as a whole. Layers of a
     surface that touch have cells of their own.
     """
@@ -183,7 +183,7 @@ def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> 
     kept = torch.where(first, -off, -9.0).topk(count, dim=1)
     chosen = kept.values > -9
     if most is not None:
-        chosen = chosen & (torch.arange(count, device=most.device) < most[:, None])
+        chosen = chosen & (torch.arange(count, device=chosen.device) < most.to(chosen.device)[:, None])
     return order.gather(1, kept.indices), chosen
 
 

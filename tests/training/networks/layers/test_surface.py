@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
+from trimesh.remesh import subdivide
 
 from datagen.mesh.geometry import Mesh, edges_of
 from tests.support.shapes.samples import offsets_of
@@ -11,7 +12,7 @@ from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks import parts
 from training.networks.layers import sampling
-from training.networks.layers.sampling import sample
+from training.networks.layers.sampling import Sample, sample
 from training.networks.layers.surface import Surface, joined, of_cells, surface_of
 from training.networks.parts import Parts
 
@@ -200,17 +201,23 @@ def test_crumbs_are_one_cell_that_is_near_to_all() -> None:
     assert (found == near(mesh)).all()
 
 
-@pytest.mark.parametrize("joined_at_the_end", [True, False])
-def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it(joined_at_the_end: bool) -> None:
-    """Two strips that touch, one part each: the parts' shares of a few vertices are exchanged."""
-    mesh = hairpin(joined_at_the_end=joined_at_the_end)
-    half, few = len(mesh.vertices) // 2, slice(3, 6)
-    logits = torch.tensor([4.0, 0.0, 2.0]).repeat(2 * half, 1)
-    logits[half:] = logits[half:, [1, 0, 2]]
+def two_parts(mesh: Mesh, few: slice) -> torch.Tensor:
+    """Logits [1, n, 3] of a hairpin's strips, a part each; the shares of a few vertices of the first are exchanged."""
+    logits = torch.tensor([4.0, 0.0, 2.0]).repeat(len(mesh.vertices), 1)
+    logits[len(logits) // 2 :] = logits[len(logits) // 2 :, [1, 0, 2]]
     logits[few] = logits[few][:, [1, 0, 2]]
-    surface = surface_of(mesh.vertices, edges_of(mesh.faces))
-    weights, as_read = parts._weights(logits[None], surface)[0], logits.softmax(1)
-    assert torch.equal(parts._weights(logits[None], None)[0], as_read)
+    return logits[None]
+
+
+@pytest.mark.parametrize("joined_at_the_end", [True, False])
+def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it(
+    joined_at_the_end: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, few = hairpin(joined_at_the_end=joined_at_the_end), slice(3, 6)
+    vertices, half = torch.from_numpy(mesh.vertices).float()[None], len(mesh.vertices) // 2
+    logits, drawn = two_parts(mesh, few), sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
+    weights, as_read = parts._weights(logits, drawn)[0], logits.softmax(2)[0]
+    assert torch.equal(parts._weights(logits, sample(vertices))[0], as_read)
     if not joined_at_the_end:
         assert torch.equal(weights, as_read), "what no edge joins may be of one part"
         return
@@ -218,5 +225,39 @@ def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it
     torch.testing.assert_close(weights.sum(1), torch.ones(2 * half))
     others = torch.tensor([vertex for vertex in range(half) if vertex not in range(*few.indices(half))])
     assert weights[others].argmax(1).eq(0).all() and weights[half:].argmax(1).eq(1).all()
-    nowhere = torch.full_like(logits, -9.0).scatter(1, torch.arange(2 * half)[:, None] % 3, 9.0)
-    assert parts._weights(nowhere[None], surface).isfinite().all()
+    monkeypatch.setattr(parts, "_LEAST_NEAR", 0.6)
+    nowhere = parts._weights(logits, drawn)[0]
+    assert nowhere.isfinite().all() and torch.equal(nowhere[: half // 10], as_read[: half // 10]), "no part is near"
+
+
+def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -> None:
+    """One end of the hairpin has nearly all vertices of the part, and no more of its surface than the other."""
+    mesh = hairpin()
+    fine = np.flatnonzero((mesh.vertices[mesh.faces, 0] > 0.7).all(axis=1))
+    for _ in range(3):
+        count = len(mesh.faces) - len(fine)
+        mesh = Mesh(*subdivide(mesh.vertices, mesh.faces, fine))
+        fine = np.arange(count, len(mesh.faces))
+    logits = torch.tensor([4.0, 0.0, 2.0]).repeat(len(mesh.vertices), 1)[None]
+    drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
+    assert (mesh.vertices[:, 0] < -0.6).mean() < parts._LEAST_NEAR, "else this shows nothing"
+    assert torch.equal(parts._weights(logits, drawn), logits.softmax(2))
+
+
+@torch.no_grad()
+def test_targets_and_projections_are_posed_by_parts_that_are_near(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, mesh = lively("parts").eval(), hairpin()
+    assert isinstance(network, Parts)
+    vertices = torch.from_numpy(mesh.vertices).float()[None]
+    surface = surface_of(mesh.vertices, edges_of(mesh.faces))
+    drawn = sample(vertices, surface)
+    asked = list[Sample]()
+
+    def weights_of(logits: torch.Tensor, drawn: Sample) -> torch.Tensor:
+        asked.append(drawn)
+        return torch.zeros_like(logits)
+
+    monkeypatch.setattr(parts, "_weights", weights_of)
+    for weights in (network.read_target(vertices, surface).weights, network.skinning_weights(drawn, vertices)):
+        assert weights.shape == (1, len(mesh.vertices), len(network.joints)) and not weights.any()
+    assert len(asked) == 2 and asked[1] is drawn and torch.equal(asked[0].rows, drawn.rows)
