@@ -5,9 +5,9 @@ the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better s
 that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
 a body is no difference. Filtered people, and people of points, are read twice, as they are and as their mirror images
 (animals' rigs are not alike on both sides), of points more than of vertices. Sources that list the vertices of their
-targets are read at the same ones. A transfer reads its meshes so, and what measures transfers of single
-meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is
-a body, in which pose an avatar is to be, or onto which parts an output is projected.
+targets are read at the same ones. A transfer reads its meshes so, and what measures transfers of single meshes.
+Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body,
+in which pose an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence

@@ -160,9 +160,9 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
-    Of more cells than the sample takes (``most`` [b], or `MOST_SAMPLED`), those are taken whose vertex is nearest to the middle: on a body they lie more
-    evenly than a draw (docs/results/parts.md), but flat faces along the grid may be left out as a whole. Layers of a
-    surface that touch have cells of their own.
+    Of more cells than the sample takes (``most`` [b], or `MOST_SAMPLED`), those are taken whose vertex is nearest to
+    the middle: on a body they lie more evenly than a draw (docs/results/parts.md), but flat faces along the grid may be
+    left out as a whole. Layers of a surface that touch have cells of their own.
     """
     scaled = vertices.nan_to_num().clamp(-_BEYOND, _BEYOND) / _CELL
     cell = scaled.floor()
