@@ -104,12 +104,12 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
-    angles about the vertical are tried; then 26 directions as its way upward, each at twelve angles, which a few
-    vertices rank before the first of them are read as well as the others; and small turns of the best. Another way is
-    taken where it is clearly better understood. A body whose way upward is at most 50 degrees from the file's Y then
-    leans; as that may be the pose, it is said, not undone. Else a way between the mesh' axes is taken where it is
-    clearly better than all along them: nothing but the body says which way is up then, so its root is brought to rest.
-    A lean that is understood is left, too (`facing`).
+    angles about the vertical are tried, which do where one is well understood; then 26 directions as its way upward,
+    each at twelve angles, which a few vertices rank before the first of them are read as well as the others; and small
+    turns of the best. Another way is taken where it is clearly better understood. A body whose way upward is at most 50
+    degrees from the file's Y then leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
+    axes is taken where it is clearly better than all along them: nothing but the body says which way is up then, so its
+    root is brought to rest. A lean that is understood is left, too (`facing`).
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
-    if understood and (ahead := ways.ahead(best)).misfit <= KNOWN:
+    if understood and (ahead := ways.ahead(best)).misfit <= KNOWN / 2:
         return ahead.stands
     every = ways.seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES], _FIRST_VERTICES)
     along_axes, best = (ways.best_of(some) for some in (every[: _SIDES * len(_ANGLES)], every))

@@ -87,6 +87,24 @@ def test_a_turn_about_the_vertical_is_found_without_all_other_ways(angle: float)
     assert sum(read) <= 20
 
 
+@pytest.mark.parametrize(("misfit_behind", "is_taken"), [(0.0008, True), (0.0017, False)])
+def test_a_way_about_the_vertical_that_is_understood_so_so_is_taken_only_where_no_other_is_better(
+    misfit_behind: float, is_taken: bool
+) -> None:
+    """A body that leans by 45 degrees, and is taken for one that leans the other way when it is turned round."""
+    lean = Rotation.from_euler("x", 45, degrees=True)
+    behind = Rotation.from_euler("y", 180, degrees=True) * lean
+
+    def confused(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        misfits, roots = understand(meshes)
+        is_behind = np.array([(behind.inv() * turn).magnitude() < 0.3 for turn in turns_of(meshes)])
+        return np.where(is_behind, misfit_behind, misfits), roots
+
+    found = standing(confused, lean.apply(BODY))
+    left = (Rotation.from_matrix(found.lean.T @ found.matrix) * lean).magnitude()
+    assert (left > 3) == is_taken and (left < 0.1) == (not is_taken)
+
+
 def test_what_is_broken_is_understood_in_no_way_and_no_error() -> None:
     nothing = np.full((1, 3, 3), np.nan)
     found = standing(lambda meshes: (np.full(len(meshes), np.nan), np.repeat(nothing, len(meshes), axis=0)), BODY)
