@@ -51,7 +51,7 @@ _MOST_POINTS = 2 * MOST_SAMPLED
 """Points that are read at most, as what they lack in faces more of them make up for (docs/results/parts.md)."""
 _SHARED = 3
 """Corners of faces for one vertex at least, where faces tell which vertices are listed: triangle soups have one, soups
-of quads one and a half, closed meshes six.
+of quads one and a half, large closed meshes about six. Of soups of small closed pieces it does not tell.
 """
 _NEIGHBOURS = 8
 """Of points, that are taken to be near them along the surface."""

@@ -104,12 +104,12 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
-    angles about the vertical are tried, which do where one is well understood; then 26 directions as its way upward,
-    each at twelve angles, which a few vertices rank before the first of them are read as well as the others; and small
-    turns of the best. Another way is taken where it is clearly better understood. A body whose way upward is at most 50
-    degrees from the file's Y then leans; as that may be the pose, it is said, not undone. Else a way between the mesh'
-    axes is taken where it is clearly better than all along them: nothing but the body says which way is up then, so its
-    root is brought to rest. A lean that is understood is left, too (`facing`).
+    angles about the vertical are tried, which do where one is understood twice as well as it must be; then 26
+    directions as its way upward, each at twelve angles, which a few vertices rank before the first of them are read as
+    well as the others; and small turns of the best. Another way is taken where it is clearly better understood. A body
+    whose way upward is at most 50 degrees from the file's Y then leans; as that may be the pose, it is said, not
+    undone. Else a way between the mesh' axes is taken where it is clearly better than all along them: nothing but the
+    body says which way is up then, so its root is brought to rest. A lean that is understood is left, too (`facing`).
 
     Parameters
     ----------
@@ -123,7 +123,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
-    if understood and (ahead := ways.ahead(best)).misfit <= KNOWN / 2:
+    ahead = ways.ahead(best) if understood else None
+    if ahead and ahead.misfit <= KNOWN / 2:
         return ahead.stands
     every = ways.seen([_about_vertical(angle) @ up for up in _upward() for angle in _ANGLES], _FIRST_VERTICES)
     along_axes, best = (ways.best_of(some) for some in (every[: _SIDES * len(_ANGLES)], every))
@@ -133,10 +134,15 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         best = min(ways.seen([best.way, *tilted]), key=lambda way: way.misfit)
     found, upright = ways.faced(along_axes), ways.turned(best, lambda found: found.root.T)
     likely = _CLEARLY * upright.misfit < as_it_is.misfit and upright.misfit <= _CLEARLY * found.misfit
-    if likely and _leaning(upright.way.T) <= _LEANS:
-        return upright.leans
-    if along_axes.misfit > _CLEARLY * best.misfit:
+    leans = likely and _leaning(upright.way.T) <= _LEANS
+    if leans:
+        found = upright
+    elif along_axes.misfit > _CLEARLY * best.misfit:
         found = min(found, upright, key=lambda way: way.misfit)
+    if ahead and ahead.misfit <= min(KNOWN, _CLEARLY * found.misfit):
+        return ahead.stands
+    if leans:
+        return upright.leans
     return found.stands if _CLEARLY * found.misfit < as_it_is.misfit else as_it_is.stands
 
 

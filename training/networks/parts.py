@@ -44,7 +44,7 @@ it was read (docs/results/parts.md).
 """
 
 _LEAST_NEAR = 0.07
-"""Share of a part's weight that lies near, along the surface, to each vertex that follows the part."""
+"""Share of a part, by surface, that lies near along it to each vertex that follows the part."""
 
 
 class Reading(NamedTuple):

@@ -105,6 +105,17 @@ def test_a_way_about_the_vertical_that_is_understood_so_so_is_taken_only_where_n
     assert (left > 3) == is_taken and (left < 0.1) == (not is_taken)
 
 
+def test_a_turn_about_the_vertical_stays_one_where_no_other_way_is_clearly_better() -> None:
+    """Of a body that bows a little and is never understood well, as one in clothes."""
+
+    def roughly(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        misfits, roots = understand(meshes)
+        return np.maximum(misfits, 0.0015), roots
+
+    found = standing(roughly, Rotation.from_euler("yx", [120, 10], degrees=True).apply(BODY))
+    assert np.array_equal(found.lean, np.eye(3)) and np.allclose(found.matrix[1], [0, 1, 0])
+
+
 def test_what_is_broken_is_understood_in_no_way_and_no_error() -> None:
     nothing = np.full((1, 3, 3), np.nan)
     found = standing(lambda meshes: (np.full(len(meshes), np.nan), np.repeat(nothing, len(meshes), axis=0)), BODY)
