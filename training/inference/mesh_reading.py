@@ -4,10 +4,11 @@ A parts network poses the vertices of a mesh as they are, but may read them othe
 the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. Outputs of people
 that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
 a body is no difference. Filtered people, and people of points, are read twice, as they are and as their mirror images
-(animals' rigs are not alike on both sides), of points more than of vertices. Sources that list the vertices of their
-targets are read at the same ones. A transfer reads its meshes so, and what measures transfers of single meshes.
-Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body,
-in which pose an avatar is to be, or onto which parts an output is projected.
+(animals' rigs are not alike on both sides). Of a source of points up to 2,048 are read, of a mesh 1,024 vertices; a
+source that lists the vertices of its target in the same order is read at those at which the target is. A transfer reads
+its meshes so, and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise, do
+not; nor does what asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which parts
+an output is projected.
 """
 
 from collections.abc import Sequence
@@ -48,10 +49,12 @@ _STILL = 0.008
 filter changes next to nothing: noise of 0.01 is moved by more.
 """
 _MOST_POINTS = 2 * MOST_SAMPLED
-"""Points that are read at most, as what they lack in faces more of them make up for (docs/results/parts.md)."""
-_SHARED = 3
-"""Corners of faces for one vertex at least, where faces tell which vertices are listed: triangle soups have one, soups
-of quads one and a half, large closed meshes about six. Of soups of small closed pieces it does not tell.
+"""Points of a source that are read at most: twice as many as of a mesh leave a tenth less error
+(docs/results/parts.md)."""
+_CORNERS_A_VERTEX = 3
+"""How many corners of faces a vertex has at least, on average, where faces tell which vertices are listed: in triangle
+soups one, in soups of quads one and a half, in large closed meshes about six. Of soups of small closed pieces it does
+not tell.
 """
 _NEIGHBOURS = 8
 """Of points, that are taken to be near them along the surface."""
@@ -89,7 +92,7 @@ def lists_alike(one: Mesh, other: Mesh) -> bool:
     Not where most faces list vertices of their own, as unwelded ones do: 0, 1, 2, then 3, 4, 5, whatever these are.
     """
     alike = len(one.vertices) == len(other.vertices) and np.array_equal(one.faces, other.faces)
-    return alike and np.size(one.faces) >= _SHARED * len(one.vertices) and not has_points(one)
+    return alike and np.size(one.faces) >= _CORNERS_A_VERTEX * len(one.vertices) and not has_points(one)
 
 
 def device_of(network: nn.Module) -> torch.device:

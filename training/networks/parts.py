@@ -42,9 +42,9 @@ _SURELY_CORRECTED = 0.1
 """Sum of squares over the rotations' numbers up to which a correction is taken unread, as it was better each time that
 it was read (docs/results/parts.md).
 """
-
 _LEAST_NEAR = 0.07
-"""Share of a part, by surface, that lies near along it to each vertex that follows the part."""
+"""Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part
+(docs/results/parts.md)."""
 
 
 class Reading(NamedTuple):
