@@ -43,9 +43,9 @@ def understanding_of(network: Parts) -> Understanding:
 MISREAD = 9.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
 animals that were read rightly by weights of their kind have less; all else has more but for a table or an animal by
-weights of people, and people in a coat or on all fours by those of animals (docs/results/transfer.md)."""
+weights of people, and people on all fours by those of animals (docs/results/transfer.md)."""
 KNOWN = 0.002
-"""Misfit up to which a mesh is well understood as it stands; bare people have 0.0014 at most
+"""Misfit up to which a mesh is well understood as it stands; bare people have 0.0013 at most
 (docs/results/transfer.md)."""
 _STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own

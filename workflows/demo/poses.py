@@ -1,6 +1,7 @@
 """Poses of made-up bodies: at rest, random ones, those of a person's own file, and joints turned by hand.
 
-Random poses come from the distributions of the recipes ``human`` and ``animals``, with a seed of the page's own.
+Random poses come from the distributions of the recipes ``human`` and, without its jitter, ``animals``, with a seed of
+the page's own.
 """
 
 import math
