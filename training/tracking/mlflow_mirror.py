@@ -179,17 +179,12 @@ class _Publication:
     def _runs_of_record(self, experiment: str) -> list[Any]:
         return list(
             self.client.search_runs(
-                [experiment], f"tags.`{_RECORD_TAG}` = '{self._id}'", order_by=["attributes.start_time ASC"]
+                [experiment], f"tags.`{_RECORD_TAG}` = '{self.record.id}'", order_by=["attributes.start_time ASC"]
             )
         )
 
-    @property
-    def _id(self) -> str:
-        """The record's id; a record of an earlier version is told by its start."""
-        return self.record.id or f"{self.record.name} {self.record.started}"
-
     def _create_run(self, experiment: str) -> None:
-        tags = {"kind": self.record.kind, _RECORD_TAG: self._id}
+        tags = {"kind": self.record.kind, _RECORD_TAG: self.record.id}
         parent = self._parent()
         if parent:
             tags[_PARENT_TAG] = parent
@@ -268,7 +263,7 @@ class _Publication:
         self._registration().register(self.record.model or "", parent=self._parent())
 
     def _registration(self) -> Registration:
-        marks = {_RECORD_TAG: self._id, _WEIGHTS_TAG: self.record.model_version}
+        marks = {_RECORD_TAG: self.record.id, _WEIGHTS_TAG: self.record.model_version}
         experiment = _experiment(self.client, self.server)
         return Registration(self.client, experiment, self.sent["run"], self.folder, marks)
 

@@ -118,7 +118,7 @@ def begin_record(folder: Path, *, name: str, kind: str, parent: Path | None, par
         parameters=parameters,
         tags=_tags() if parent else _tags() | {"dsffnet.command": _command()},
         started=before.started if before else _now(),
-        id=(before.id if before else "") or uuid.uuid4().hex,
+        id=before.id if before else uuid.uuid4().hex,
     )
     with _changing:
         write_record(folder, record)

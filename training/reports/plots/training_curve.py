@@ -104,16 +104,12 @@ class _Curve:
 
 
 def _coefficients(rows: Sequence[Mapping[str, float]]) -> list[_Curve]:
-    """Return the curves modulation/KIND/BLOCK.NORM of alpha and beta; a norm has a colour, beta is dashed.
-
-    Earlier journals have KIND/BLOCK.NORM, and both where a run was resumed.
-    """
-    rows = [{key.removeprefix("modulation/"): value for key, value in row.items()} for row in rows]
-    keys = sorted({key for row in rows for key in row if key.startswith(("alpha/", "beta/"))})
+    """Return the curves modulation/KIND/BLOCK.NORM of alpha and beta; a norm has a colour, beta is dashed."""
+    keys = _keys(rows, "modulation/")
     norms = sorted({key.rpartition(".")[2] for key in keys})
     found = []
     for key in keys:
-        kind, place = key.split("/", 1)
+        _, kind, place = key.split("/", 2)
         block, _, norm = place.rpartition(".")
         color = _NORM_COLORS[norms.index(norm) % len(_NORM_COLORS)]
         label = f"{'α' if kind == 'alpha' else 'β'} {norm}"
