@@ -18,6 +18,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from datagen.common.arrays import Floats
+from datagen.common.files import atomic_file
 from datagen.common.printable import printable_lines
 
 ROLE_COLORS: Mapping[str, tuple[float, float, float]] = {
@@ -69,19 +70,13 @@ def short(name: str, letters: int = 60) -> str:
 
 
 def saved(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write under a temporary name and rename, so that a reader never meets half a picture."""
+    """Write a picture that appears whole or not at all (StorageError where it cannot be written)."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     for text in figure.findobj(Text):
         text.set_text(printable_lines(text.get_text()))
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # it is drawn as a box
-            figure.savefig(temporary, format="png", dpi=DPI)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_file(path) as file, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # it is drawn as a box
+        figure.savefig(file, format="png", dpi=DPI)
     return path
 
 

@@ -181,10 +181,11 @@ def server_of(out: Path, uri: str | None) -> Server:
 
 def server_of_record(root: Path, uri: str | None) -> Server:
     """The server for a record; a run that is no part of a workflow has its SQLite store beside it."""
+    from workflows.pipeline.run_folder import workflow_kinds
+
     root = root.resolve()  # what is beside a link is not beside the run
     record = read_record(root)
-    is_workflow = record is not None and record.kind in ("workflow", "sweep", "comparison", "ablation")
-    return server_of(root if is_workflow else root.parent, uri)
+    return server_of(root if record is not None and record.kind in workflow_kinds() else root.parent, uri)
 
 
 @contextmanager

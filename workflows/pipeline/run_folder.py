@@ -290,6 +290,14 @@ class AblationFolder(ComparisonFolder):
     kind = "ablation"
 
 
+def workflow_kinds() -> set[str]:
+    """The kinds of work that have a folder, with an MLflow store, for all that they make."""
+    found = [WorkflowFolder]
+    for each in found:
+        found.extend(each.__subclasses__())
+    return {each.kind for each in found}
+
+
 def require_place(path: Path) -> None:
     """Refuse what is a file or a dataset, or lies in one: no folder of work can be made there.
 

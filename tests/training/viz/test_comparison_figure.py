@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from datagen.common.arrays import Floats
+from datagen.common.errors import StorageError
 from datagen.mesh.geometry import Mesh
 from tests.support.reports.pictures import caught, octahedron, pixels
 from training.viz import comparison_figure as module
@@ -214,6 +215,6 @@ def test_a_failed_write_leaves_the_old_figure_and_no_litter(tmp_path: Path, monk
         raise OSError("No space left on device")
 
     monkeypatch.setattr(Figure, "savefig", full_disk)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(StorageError, match="No space"):
         comparison_figure([comparison(ours=0.5)], path, panel=PANEL)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

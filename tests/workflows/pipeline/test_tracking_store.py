@@ -28,7 +28,14 @@ from training.tracking.record import EXPERIMENT, Server, begin_record, update_re
 from workflows import full
 from workflows.cli import runs, transfer
 from workflows.pipeline.console import guarded, server_of, server_of_record
-from workflows.pipeline.run_folder import SingleRunFolder
+from workflows.pipeline.run_folder import (
+    AblationFolder,
+    AvatarFolder,
+    ComparisonFolder,
+    SingleRunFolder,
+    SweepFolder,
+    WorkflowFolder,
+)
 
 ROOT = Path(__file__).parents[3]
 AWKWARD = "a b #1 & 'q' \"d\" ; 日本é [x]{y}|~ $HOME 50:50 @=+,!<>"
@@ -346,6 +353,15 @@ def test_how_to_send_later_names_only_a_store_that_was_named(
     for uri, says in ((None, f"dsffnet sync {out} sends"), (server(out).uri, f" --tracking-uri {server(out).uri} s")):
         with pytest.raises(TrackingError, match=re.escape(says)):
             publish(out, server_of(out, uri))
+
+
+@pytest.mark.parametrize("folder", [WorkflowFolder, AvatarFolder, SweepFolder, ComparisonFolder, AblationFolder])
+def test_work_that_makes_a_dataset_has_its_store_inside(folder: type[WorkflowFolder], tmp_path: Path) -> None:
+    """So ``dsffnet sync`` sends to where the work itself did; a single training's store lies beside it."""
+    begin_record(tmp_path / "out", name="whole", kind=folder.kind, parent=None, parameters={})
+    begin_record(tmp_path / "run", name="train", kind="train", parent=None, parameters={})
+    assert server_of_record(tmp_path / "out", None) == server_of(tmp_path / "out", None)
+    assert server_of_record(tmp_path / "run", None) == server_of(tmp_path, None)
 
 
 def test_a_link_to_a_folder_has_the_store_of_the_folder(
