@@ -38,7 +38,7 @@ from workflows.cli.declare import (
     recipe_keys,
 )
 from workflows.pipeline.console import at_work, guarded, print_text
-from workflows.pipeline.evaluate import evaluate_weights, is_evaluated
+from workflows.pipeline.evaluate import evaluate_weights, is_evaluated, names_of
 from workflows.pipeline.forecast import announce_times
 from workflows.pipeline.generate import generate_stage
 from workflows.pipeline.ray_cluster import require_reachable
@@ -84,6 +84,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
     trainings = [(folder.run, "train", MODEL, recipe.training)]
     if recipe.beside:
         trainings.append((folder.beside, "train-beside", f"{MODEL}-beside", recipe.beside))
+    networks = names_of([training for *_, training in trainings])
     refuse_conflicts(recipe.data, folder, {run.path: training for run, _, _, training in trainings})
     announce_times(recipe.data, {name: training for run, name, _, training in trainings if not has_record(run.path)})
     with ExitStack() as around:
@@ -91,7 +92,7 @@ def run_workflow(recipe: WorkflowRecipe, out: Path, tasks: TaskRunner) -> None:
         evaluate = Stage(
             "evaluate",
             depends_on=[sections[name] for name in ("data", "training", "beside", "evaluation") if name in sections],
-            intact=lambda: known and is_evaluated(recipe.evaluation, folder.data, folder.run),
+            intact=lambda: known and is_evaluated(recipe.evaluation, folder.data, folder.run, networks),
             work=lambda: _evaluate(recipe, folder, tasks),
         )
         report = Stage(

@@ -12,6 +12,7 @@ from training.evaluation.tables import methods_of
 from training.recipes.training import EvaluationRecipe
 from training.tracking.record import MODEL, read_record
 from workflows import full
+from workflows.pipeline.evaluate import evaluate_weights
 from workflows.pipeline.run_folder import SingleRunFolder
 from workflows.pipeline.tasks import TaskRunner
 from workflows.recipe.loader import WorkflowRecipe, load_recipe
@@ -45,6 +46,12 @@ def test_both_are_trained_and_measured_on_the_same_triples(tmp_path: Path, capsy
     full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
     said = capsys.readouterr().out
     assert all(f"{stage}: skipped" in said for stage in ("generate", "train", "train-beside", "evaluate", "report"))
+    runner = TaskRunner(local=True)
+    evaluate_weights(recipe.evaluation, folder.data, folder.run.path, parent=None, tasks=runner)
+    capsys.readouterr()
+    full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
+    assert "evaluate: finished" in capsys.readouterr().out, "the first alone was measured in between"
+    assert {"DSFFNet", "NPT"} < set(methods_of(read_rows(folder.run.evaluation.rows)))
     shutil.rmtree(folder.beside.path)
     full.run_workflow(recipe, tmp_path, TaskRunner(local=True))
     said = capsys.readouterr().out

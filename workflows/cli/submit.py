@@ -7,6 +7,7 @@ node died and nobody is left to note a failure.
 import argparse
 import asyncio
 import shlex
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -97,7 +98,8 @@ def _follow_with_log(job: "RayJob") -> None:
         follow(job)
     finally:
         over.set()
-        log.join(_LOG_SECONDS)
+        if not isinstance(sys.exception(), KeyboardInterrupt):  # the job goes on, and its log with it
+            log.join(_LOG_SECONDS)
 
 
 class RayJob:

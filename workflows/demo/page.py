@@ -15,7 +15,7 @@ from workflows.demo.controls import BodyControls
 from workflows.demo.poses import PERSON
 from workflows.demo.session import Session
 from workflows.demo.stage import Stage
-from workflows.demo.transfers import Asked, Outcome, Posed, Switches, Transfers, clash_of
+from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of
 
 _STYLE = """<style>
 input[type=file] { display: block !important; width: calc(100% - 20px); margin: 0 10px 6px; padding: 14px 10px;
@@ -81,7 +81,7 @@ class Page:
         self._progress.value = 100 * len(outcome.frames) / outcome.count
         if len(outcome.frames) == 1:
             self._offer_downloads(True)
-            self._draw(outcome, outcome.frames[0])
+            self._draw(outcome)
             self._stage.arrange()
         self._status.content = about(outcome, self.session.folder)
 
@@ -214,10 +214,11 @@ class Page:
         with self._drawing:
             outcome = self.session.outcome
             if outcome is not None:
-                self._draw(outcome, outcome.frames[self._frame % len(outcome.frames)])
+                self._draw(outcome)
 
-    def _draw(self, outcome: Outcome, frame: Posed) -> None:
+    def _draw(self, outcome: Outcome) -> None:
         with self._drawing, self._client.atomic():
+            frame = outcome.frames[place_of(self._frame, outcome)]
             garments = outcome.garments
             sizes = {role: float(np.ptp(getattr(frame, role).vertices, axis=0).max()) for role in ("source", "target")}
             errors = frame.errors if self._errors.value else None
@@ -236,12 +237,12 @@ class Page:
                 outcome = self.session.outcome
                 if outcome is not None and len(outcome.frames) > 1:
                     self._frame += 1
-                    self._draw(outcome, outcome.frames[_place(self._frame, outcome)])
+                    self._draw(outcome)
 
 
-def _place(frame: int, outcome: Outcome) -> int:
+def place_of(frame: int, outcome: Outcome) -> int:
     """Which frame of a sequence comes as the so manieth; the way between random poses is played back and forth."""
     count, source = len(outcome.frames), outcome.asked.source
-    if isinstance(source, Figure) and not source.pose.file:
+    if count > 1 and isinstance(source, Figure) and not source.pose.file:
         return abs((frame + count - 1) % (2 * count - 2) - (count - 1))
     return frame % count

@@ -90,14 +90,19 @@ class _Shown(NamedTuple):
 
 
 def _shown(weights: Sequence[Evaluated]) -> dict[str, _Shown]:
-    """Weights by the names that tables give them; a second one of the same name says that it is."""
-    found: dict[str, _Shown] = {}
-    for each in weights:
-        network, trained, step = load_trained(each.weights)
-        name = trained.network.title
-        name = f"{name} beside" if name in found else name
-        found[name] = _Shown(Method(name, str(each.weights)), network, step, trained)
-    return found
+    """Weights by the names that tables give them."""
+    loaded = [load_trained(each.weights) for each in weights]
+    names = names_of([trained for _, trained, _ in loaded])
+    return {
+        name: _Shown(Method(name, str(each.weights)), network, step, trained)
+        for name, each, (network, trained, step) in zip(names, weights, loaded, strict=True)
+    }
+
+
+def names_of(trainings: Sequence[TrainingRecipe]) -> list[str]:
+    """Return what tables call the networks of some trainings; a second one of the same name says that it is."""
+    titles = [training.network.title for training in trainings]
+    return [f"{title} beside" if title in titles[:place] else title for place, title in enumerate(titles)]
 
 
 def _describe_model(weights: Evaluated, shown: _Shown, name: str, dataset: Dataset, rows: list[Row]) -> None:
@@ -130,13 +135,14 @@ def _no_ops(rows: list[Row]) -> dict[str, float]:
     return {f"{name} (unseen)": float(np.mean(values)) for name, values in found.items() if values}
 
 
-def is_evaluated(recipe: EvaluationRecipe, data: str, run: RunFolder) -> bool:
-    """Whether the outputs of this evaluation on this dataset are there."""
+def is_evaluated(recipe: EvaluationRecipe, data: str, run: RunFolder, names: Sequence[str] = ()) -> bool:
+    """Whether the outputs of this evaluation on this dataset are there, those of networks of these names among them."""
     record = read_record(run.evaluation.path)
     if record is None or record.status != "FINISHED" or record.parameters != flatten(recipe.model_dump(mode="json")):
         return False
     shown = (run.evaluation.examples, run.evaluation.curve)
-    return _is_of(record, data) and is_whole(run.evaluation) and all(map(_has_content, shown))
+    measured = measured_methods(run.evaluation)
+    return bool(measured) and measured.issuperset(names) and _is_of(record, data) and all(map(_has_content, shown))
 
 
 def _is_of(record: Record, data: str) -> bool:
@@ -148,13 +154,13 @@ def _is_of(record: Record, data: str) -> bool:
     return record.dataset is not None and all(record.dataset.get(key) == there[key] for key in CONTENT)
 
 
-def is_whole(evaluation: EvaluationFolder) -> bool:
-    """Whether the viewer of an evaluation is there, and its rows and tables can be read."""
+def measured_methods(evaluation: EvaluationFolder) -> set[str]:
+    """The methods that an evaluation has rows of; none where its viewer is missing, or its tables are unreadable."""
     try:
         rows, tables = read_rows(evaluation.rows), read_text_within(evaluation.path, evaluation.tables.name)
-        return bool(rows and tables) and _has_content(evaluation.viewer)
     except (OSError, DsffnetError):
-        return False
+        return set()
+    return {row.method for row in rows} if tables and _has_content(evaluation.viewer) else set()
 
 
 def _has_content(path: Path) -> bool:

@@ -21,7 +21,7 @@ from training.evaluation.results import RowType, kept_rows, write_csv
 from training.tracking.record import read_record, update_record
 from workflows.pipeline.console import print_text
 from workflows.pipeline.ray_cluster import require_reachable
-from workflows.pipeline.run_folder import require_place
+from workflows.pipeline.run_folder import EvaluationFolder, require_place
 from workflows.pipeline.stage import recorded
 from workflows.pipeline.weights_argument import Evaluated, evaluated
 
@@ -100,8 +100,8 @@ def about_weights(weights: Sequence[Evaluated]) -> list[str]:
     return [f"step {each.checkpoint.step} {fingerprint_of(each.checkpoint)}" for each in weights]
 
 
-def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
-    """Whether a folder's rows were measured with these settings; from now on the folder's rows are."""
+def keep_rows_if(folder: Path, settings: dict[str, Any]) -> None:
+    """Remove a folder's rows unless they were measured with these settings; from now on the folder's rows are."""
     text = json.dumps({"measured_as": _MEASURED_AS, **settings}, indent=1, sort_keys=True).encode()
     try:
         same = read_within(folder, _SETTINGS) == text
@@ -110,7 +110,6 @@ def same_settings(folder: Path, settings: dict[str, Any]) -> bool:
     if not same:
         (folder / "rows.csv").unlink(missing_ok=True)
         write_atomically(folder / _SETTINGS, text)
-    return same
 
 
 class Study(ABC, Generic[RowType]):
@@ -162,7 +161,10 @@ class Study(ABC, Generic[RowType]):
 def run_study(study: Study[RowType]) -> None:
     """Measure what is missing, draw, write and print the report, and record it for MLflow."""
     folder, parent = study.folder, parent_of(study.weights)
-    with recorded(folder, kind="evaluate", name=study.name, parent=parent, parameters=study.settings):
+    with (
+        EvaluationFolder(folder).alone(),
+        recorded(folder, kind="evaluate", name=study.name, parent=parent, parameters=study.settings),
+    ):
         rows = _measured(study)
         study.draw(rows)
         text = study.report(rows)
@@ -176,7 +178,7 @@ def run_study(study: Study[RowType]) -> None:
 def _measured(study: Study[RowType]) -> list[RowType]:
     """All rows of the folder: those that were there with these settings, and what is missing."""
     path = study.folder / "rows.csv"
-    same_settings(study.folder, study.settings)
+    keep_rows_if(study.folder, study.settings)
     rows, saved = kept_rows(path, study.row), time.monotonic()
     for some in study.measure(list(rows)):
         rows += some

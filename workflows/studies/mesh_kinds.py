@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from datagen.bodies.standins.smpl_format import write_standin
-from datagen.common.errors import DsffnetError
+from datagen.common.errors import DatasetError, DsffnetError
 from datagen.common.printable import printable
 from datagen.generate import generate
 from datagen.recipe import (
@@ -111,7 +111,11 @@ def _standin(base: DatasetRecipe, folder: Path, sizes: Sizes) -> MeshKind:
 
 
 def _kind(recipe: DatasetRecipe, url: Path) -> MeshKind:
-    dataset = generate(recipe, str(url.absolute()))
+    place = str(url.absolute())
+    try:
+        dataset = generate(recipe, place)
+    except DatasetError:  # of other sizes, say: a study makes its own data anew
+        dataset = generate(recipe, place, fresh=True)
     name = f"{_family(recipe)} {_counts(dataset)}"
     return MeshKind(name, dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
 

@@ -1,6 +1,8 @@
 """What ``dsffnet submit`` makes of a job's end, whatever becomes of the job, its driver, its node or the cluster."""
 
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -122,7 +124,11 @@ def test_the_command_says_how_the_job_ended(
 def test_ctrl_c_leaves_the_job_and_says_how_to_look_at_it(
     monkeypatch: pytest.MonkeyPatch, submitted: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(monkeypatch, Scripted(KeyboardInterrupt()), submitted) == 130
+    job = Scripted(KeyboardInterrupt())
+    monkeypatch.setattr(job, "print_log", lambda over: threading.Event().wait(15))
+    began = time.monotonic()
+    assert run(monkeypatch, job, submitted) == 130
+    assert time.monotonic() - began < 10, "the log of a job that goes on is not waited for"
     said = capsys.readouterr().err
     assert said.startswith("interrupted; the job continues") and "ray job logs --follow raysubmit_x" in said
     assert "run the same command again" not in said

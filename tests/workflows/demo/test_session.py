@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from training.inference.standing import Standing
 from workflows.cli import main as cli
 from workflows.demo.bodies import Figure
 from workflows.demo.captions import about, label, legend, plain
+from workflows.demo.page import place_of
 from workflows.demo.poses import PERSON, Pose
 from workflows.demo.session import Newest, Session
 from workflows.demo.transfers import Asked, Outcome, Switches, Transfers, clash_of, require_room
@@ -484,3 +486,18 @@ def test_a_sequence_of_too_many_vertices_is_refused(legs: list[Path], monkeypatc
     require_room(1, mesh, mesh)
     with pytest.raises(MeshError, match="the page plays 100: take fewer frames"):
         require_room(3, mesh, mesh)
+
+
+@pytest.mark.parametrize(
+    ("source", "places"),
+    [
+        (Figure(PERSON, (0.5,) * 6, Pose(1.0)), [0, 1, 2, 3, 2, 1, 0, 1]),
+        ((Path("walk.zip"),), [0, 1, 2, 3, 0, 1, 2, 3]),
+    ],
+)
+def test_the_way_between_random_poses_is_played_back_and_forth(source: Any, places: list[int]) -> None:
+    def played(count: int) -> list[int]:
+        outcome: Any = SimpleNamespace(frames=[None] * count, asked=SimpleNamespace(source=source))
+        return [place_of(frame, outcome) for frame in range(8)]
+
+    assert played(4) == places and played(1) == [0] * 8

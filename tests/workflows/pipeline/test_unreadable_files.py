@@ -56,7 +56,7 @@ def without_work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(full, "announce_times", lambda *_: None)  # which tries steps
     monkeypatch.setattr(generate, "is_complete", lambda *_: True)
     monkeypatch.setattr(full, "is_trained", lambda *_: True)
-    monkeypatch.setattr(full, "is_evaluated", lambda recipe, data, run: read_record(run.evaluation.path) is not None)
+    monkeypatch.setattr(full, "is_evaluated", lambda _, __, run, *___: read_record(run.evaluation.path) is not None)
     return done
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datagen.common.errors import RecipeError
+from datagen.common.errors import RecipeError, WorkflowError
 from datagen.generate import generate
 from datagen.recipe import AnnyBody, DatasetRecipe, NptPoses
 from datagen.store import open_dataset
@@ -19,9 +19,18 @@ from training.evaluation.results import read_csv
 from training.evaluation.robustness import RobustnessRow
 from training.tracking.record import begin_record, read_record
 from workflows.cli.main import parsed
+from workflows.pipeline.run_folder import EvaluationFolder
 from workflows.studies.common import about_weights, folder_of, weights_of
 from workflows.studies.generalisation import examples
-from workflows.studies.mesh_kinds import Sizes, animals_recipe, imported_kind, own_kind, own_recipe, people_recipe
+from workflows.studies.mesh_kinds import (
+    Sizes,
+    animals_recipe,
+    imported_kind,
+    make_kinds,
+    own_kind,
+    own_recipe,
+    people_recipe,
+)
 
 
 def study(*words: str) -> None:
@@ -146,6 +155,19 @@ def test_generalisation_to_a_persons_own_data(
 def test_generalisation_refuses_what_has_no_transfer(run: Path) -> None:
     with pytest.raises(RecipeError, match=r"--identities 1 .*two identities"):
         study("generalisation", str(run), "--identities", "1")
+
+
+def test_data_of_other_sizes_are_made_anew(tmp_path: Path) -> None:
+    base = DatasetRecipe()
+    for poses in (2, 3):
+        sizes = Sizes(identities=2, poses=poses, triples=2)
+        (kind,) = make_kinds(base, ["notoes_collapse3pc"], [], tmp_path, sizes, say=print)
+        assert kind.dataset.recipe.poses.seen == poses
+
+
+def test_a_study_waits_for_nobody_in_its_folder(dataset: str, run: Path, tmp_path: Path) -> None:
+    with EvaluationFolder(tmp_path / "study").alone(), pytest.raises(WorkflowError, match="another command is at work"):
+        study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / "study"), "--triples", "1")
 
 
 def test_people_are_the_same_in_every_topology_and_new() -> None:

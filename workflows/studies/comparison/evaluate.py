@@ -29,7 +29,7 @@ from training.recipes.training import EvaluationRecipe
 from training.reports.examples import comparisons_of, draw_comparisons
 from training.reports.plots.ablation import ablation_figure
 from training.reports.plots.convergence import convergence_figure
-from workflows.pipeline.evaluate import end_evaluation, evaluation_bar, is_whole
+from workflows.pipeline.evaluate import end_evaluation, evaluation_bar, measured_methods
 from workflows.pipeline.progress import sampling
 from workflows.pipeline.run_folder import ComparisonFolder, EvaluationFolder
 from workflows.pipeline.stage import recorded
@@ -47,7 +47,7 @@ def weights_of(runs: Mapping[str, Path]) -> dict[str, str]:
 def intact(folder: EvaluationFolder) -> bool:
     """Whether the outputs of the evaluation are there, and those that are read again can be read."""
     try:
-        return is_whole(folder) and bool(read_inference(folder.path.parent))
+        return bool(measured_methods(folder)) and bool(read_inference(folder.path.parent))
     except (OSError, DsffnetError):
         return False
 
