@@ -63,6 +63,11 @@ def reason_of(error: BaseException) -> str:
     return line if len(line) <= 200 else f"{line[:200]}..."
 
 
+def first_line_of(error: BaseException) -> str:
+    """Return the first line of what an exception says, cut where it is long; its type where it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
 @contextmanager
 def storage_errors(place: object, *, advice: str = "", also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Raise StorageError, with ``advice`` on what to do, for an OSError (or ``also``) while ``place`` is written.

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
-from datagen.common.errors import ClusterError
+from datagen.common.errors import ClusterError, first_line_of
 
 log = logging.getLogger(__name__)
 _SILENCE = 120.0  # seconds without a finished task before a person is told
@@ -57,7 +57,7 @@ def ray_runner(task: Task, arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
         raise error.cause from error
     except ray.exceptions.RayError as error:
         raise ClusterError(
-            f"Ray gave up on a task ({type(error).__name__}: {str(error).splitlines()[0]}). "
+            f"Ray gave up on a task ({type(error).__name__}: {first_line_of(error)}). "
             "Run the same command again to resume"
         ) from error
     finally:

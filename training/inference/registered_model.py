@@ -20,7 +20,7 @@ import mlflow
 import numpy as np
 from mlflow.pyfunc import PythonModel
 
-from datagen.common.errors import DsffnetError, MeshError, RecipeError, RegistryError
+from datagen.common.errors import DsffnetError, MeshError, RecipeError, RegistryError, first_line_of
 from datagen.mesh.files import read_mesh_file
 from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from training.inference.orientation import Axes, axes_of_both, orientation
@@ -112,8 +112,7 @@ def download_weights(uri: str, tracking_uri: str, folder: Path, *, own: bool = F
         with _server(tracking_uri):
             found = Path(mlflow.artifacts.download_artifacts(uri, dst_path=str(folder)))
     except Exception as error:  # MLflow's stores and clients raise whatever lies below them: HTTP, SQL, cloud storage
-        first = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        reason = str(error) if isinstance(error, DsffnetError) else first
+        reason = str(error) if isinstance(error, DsffnetError) else first_line_of(error)
         raise RegistryError(f"{uri} cannot be had from MLflow at {tracking_uri}: {reason}") from error
     weights = found / "artifacts" / "weights"
     if not weights.is_dir():

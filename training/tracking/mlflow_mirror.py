@@ -17,7 +17,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from datagen.common.errors import DsffnetError, TrackingError, UnsafeFileError
+from datagen.common.errors import DsffnetError, TrackingError, UnsafeFileError, first_line_of
 from datagen.common.files import lock_within
 from datagen.common.printable import printable, printable_lines
 from training.tracking.mirror_state import MetricRows, note_sent, read_sent, unsent_artifacts, unsent_rows
@@ -84,7 +84,7 @@ def _reason(error: BaseException | None) -> str:
         if words := _NO_CONNECTION.get(type(cause)):
             return words
         cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
-    return _first_line(error) if error else ""
+    return first_line_of(error) if error else ""
 
 
 _NO_CONNECTION: dict[type[BaseException], str] = {
@@ -92,10 +92,6 @@ _NO_CONNECTION: dict[type[BaseException], str] = {
     ConnectionRefusedError: "it refuses connections",
     TimeoutError: "it does not answer",
 }
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 def _how_to_sync(root: Path, server: Server | None) -> str:
@@ -316,7 +312,7 @@ def _experiment(client: Any, server: Server, *, mark: bool = False) -> str:
         try:
             mark_experiment(client, found)
         except MlflowException as error:  # of a shared server, where others alone may change it: runs are sent
-            log.debug("the experiment at %s keeps its tags: %s", server.uri, _first_line(error))
+            log.debug("the experiment at %s keeps its tags: %s", server.uri, first_line_of(error))
     return str(found.experiment_id)
 
 

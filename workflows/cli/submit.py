@@ -13,7 +13,7 @@ import time
 from contextlib import suppress
 from typing import Any, Protocol
 
-from datagen.common.errors import ClusterError
+from datagen.common.errors import ClusterError, first_line_of
 from workflows.cli.declare import Command, Parser
 
 _LOOK_SECONDS = 2.0
@@ -120,7 +120,7 @@ class RayJob:
                 raise ClusterError(
                     f"the cluster does not know job {self.name}; has its head been restarted?"
                 ) from error
-            raise ConnectionError(_first_line(error)) from error
+            raise ConnectionError(first_line_of(error)) from error
 
     def node_is_alive(self, node: str) -> bool:
         from ray.util.state import list_nodes
@@ -128,7 +128,7 @@ class RayJob:
         try:
             nodes = list_nodes(address=self._client.get_address(), raise_on_missing_output=False)
         except Exception as error:  # HTTP's, Ray's own, and a RuntimeError are among them
-            raise ConnectionError(_first_line(error)) from error
+            raise ConnectionError(first_line_of(error)) from error
         return any(each.node_id == node and each.state == "ALIVE" for each in nodes)
 
     def print_log(self, over: threading.Event) -> None:
@@ -167,13 +167,9 @@ def submitted(entrypoint: list[str], address: str | None, working_dir: str) -> R
     except (RuntimeError, ValueError, OSError, RequestException) as error:
         raise ClusterError(
             f"the job could not be submitted to {address or 'the cluster of RAY_API_SERVER_ADDRESS'}: "
-            f"{_first_line(error)}"
+            f"{first_line_of(error)}"
         ) from error
     return RayJob(client, name)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _submit_options(made: Parser) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from datagen.common.errors import ClusterError
+from datagen.common.errors import ClusterError, first_line_of
 from training.tracking.record import fail_begun
 from training.tracking.threads import background
 
@@ -46,7 +46,7 @@ def _start() -> None:
             _leave()
             if not isinstance(error, Exception):  # interrupted, or told to stop
                 raise
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            reason = first_line_of(error)
             if seconds != _START_SECONDS[-1]:
                 print(f"Ray did not start ({reason}); once more, with more time", file=sys.stderr, flush=True)
     raise ClusterError(

@@ -13,7 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from datagen.common.errors import ClusterError, DsffnetError, TrainingError, TrainingStopped, WorkflowError
+from datagen.common.errors import (
+    ClusterError,
+    DsffnetError,
+    TrainingError,
+    TrainingStopped,
+    WorkflowError,
+    first_line_of,
+)
 from datagen.common.files import read_within, write_atomically
 from datagen.store import open_dataset
 from training.engine.distributed import on_sigterm
@@ -218,5 +225,5 @@ def _outcome(reference: Any, trial: Trial, place: Place) -> Outcome:
 
 
 def _in_a_line(error: Exception) -> str:
-    first = (str(error).strip().splitlines() or [""])[0]
+    first = first_line_of(error)
     return first if isinstance(error, DsffnetError) else f"{type(error).__name__}: {first}"
