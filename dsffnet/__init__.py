@@ -8,12 +8,12 @@
 import os
 from typing import TYPE_CHECKING, Any
 
-from datagen.common.errors import DsffnetError
+from datagen.common.errors import DsffnetError, DsffnetWarning
 
 if TYPE_CHECKING:
     from dsffnet.posed import PosedMesh
 
-__all__ = ["DsffnetError", "transfer"]
+__all__ = ["DsffnetError", "DsffnetWarning", "transfer"]
 
 
 def transfer(
@@ -27,7 +27,7 @@ def transfer(
     front: str | None = None,
     force: bool = False,
 ) -> "PosedMesh":
-    """Return the target in the pose of the source; warnings go to standard error, a line each.
+    """Return the target in the pose of the source; what is doubtful is a `DsffnetWarning`.
 
     Parameters
     ----------

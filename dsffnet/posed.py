@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datagen.common.errors import DsffnetError, MeshError, RecipeError
+from datagen.common.errors import DsffnetError, DsffnetWarning, MeshError, RecipeError
+from datagen.common.printable import printable
 from datagen.mesh.files import MeshFile, read_mesh_file, write_posed
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Alone, Encoded, Surface
@@ -21,9 +23,10 @@ from datagen.mesh.geometry import InFaces, Mesh, check_mesh
 from datagen.mesh.limits import VERTEX_LIMIT, require_thickness
 from training.inference.orientation import axes_of_both
 from workflows.cli.transfer import weights_of
-from workflows.pipeline.console import warn
 from workflows.transfer.job import TransferJob
 from workflows.transfer.run import TransferWork
+
+NO_FACES = np.empty((0, 3), np.int64)
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class PosedMesh:
         with _in_words_of_python():
             job.check_places()
             for line in write_posed(self.target, self.vertices, job.out).left_out:
-                warn(line)
+                _warn(line)
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,14 @@ def _posed(source: Any, target: Any, options: Options) -> PosedMesh:
             first=read[0].mesh,
             target=read[1],
             force=options.force,
-            warn=lambda line: warn(_of_python(line)),
+            warn=_warn,
         )
         found = next(work.posed())
     return PosedMesh(np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64), job, read[1])
+
+
+def _warn(line: str) -> None:
+    warnings.warn(printable(_of_python(line)), DsffnetWarning, stacklevel=2)
 
 
 _OF_PYTHON = {
@@ -143,11 +150,13 @@ def _job(read: list[MeshFile], options: Options) -> TransferJob:
 def _mesh_file(given: Any, role: str) -> MeshFile:
     """A mesh as a file that was read: from its path, or from vertices and triangles in memory."""
     if isinstance(given, str | os.PathLike):
-        return read_mesh_file(Path(given), is_body=True)
-    mesh = check_mesh(_mesh(given, role), name=role)
+        return read_mesh_file(Path(given), is_body=True, points=role == "source")
+    mesh = check_mesh(_mesh(given, role), name=role, points=role == "source")
     if len(mesh.vertices) > VERTEX_LIMIT:
         raise MeshError(f"{role} has {len(mesh.vertices):,} vertices, more than {VERTEX_LIMIT:,}: decimate it")
-    require_thickness(InFaces.checked(mesh, name=role).mesh.vertices.astype(np.float64), Path(role))
+    require_thickness(
+        InFaces.checked(mesh, name=role, points=role == "source").mesh.vertices.astype(np.float64), Path(role)
+    )
     return MeshFile(Path(role), role, mesh, _InMemory(mesh))
 
 
@@ -155,7 +164,7 @@ def _mesh(given: Any, role: str) -> Mesh:
     if hasattr(given, "graph") and hasattr(given, "geometry"):
         return _whole(given, role)
     try:
-        both = (given.vertices, given.faces) if hasattr(given, "vertices") else given
+        both = (given.vertices, getattr(given, "faces", NO_FACES)) if hasattr(given, "vertices") else given
         vertices, faces = (np.array(each) for each in both)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # the last of a tensor with a gradient
         raise MeshError(
@@ -166,6 +175,7 @@ def _mesh(given: Any, role: str) -> Mesh:
         if array.size and array.dtype.kind not in kinds:
             wanted = "whole numbers" if what == "faces" else "real numbers"
             raise MeshError(f"{role}: its {what} are {array.dtype}, not {wanted}")
+    faces = faces.reshape(-1, 3) if not faces.size else faces
     return Mesh(vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False))
 
 

@@ -3,6 +3,8 @@
     python examples/custom_split.py                                        # people of Anny; minutes on two cores
     python examples/custom_split.py --recipe smoke --steps 60 --out /tmp/split    # procedural legs; a minute
 
+Sixty steps are too few to tell one split from another.
+
 Run it again to resume: datasets that are complete and steps that were trained are not made again.
 """
 

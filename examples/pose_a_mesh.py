@@ -1,7 +1,7 @@
 """Pose a mesh like another, and look at it.
 
     python examples/pose_a_mesh.py pose.obj person.glb posed.glb
-    python examples/pose_a_mesh.py                                  # two people of Anny, made here
+    python examples/pose_a_mesh.py                                  # two people of Anny, made in the folder two-people
 
 The weights that come along know people and animals, in any pose, size and direction. Some seconds a pair.
 """
@@ -17,13 +17,14 @@ from datagen.mesh.geometry import Mesh, edges_of
 from dsffnet import DsffnetError, transfer
 from workflows.recipe.loader import load_recipe
 
+FOLDER = Path("two-people")
 PEOPLE = ["data.identities.training=1", "data.identities.evaluation=1", "data.poses.seen=2", "data.poses.unseen=1"]
 
 
 def two_people(folder: Path) -> tuple[Path, Path]:
     """Files of somebody in some pose, and of somebody else."""
     print("making two people (the first time, Anny's files are read: some ten seconds) ...", flush=True)
-    recipe = load_recipe("quickstart", [*PEOPLE, "data.triples.count=1", "beside=null"]).data
+    recipe = load_recipe("quickstart", [*PEOPLE, "data.triples.count=0", "beside=null"]).data
     people = generate(recipe, str(folder / "two-people.zarr"))
     places = folder / "pose.obj", folder / "person.obj"
     for place, identity in zip(places, (0, 1), strict=True):
@@ -42,7 +43,7 @@ def main(words: list[str]) -> None:
     """Read, pose, write."""
     if words and len(words) != 3:
         raise SystemExit(__doc__)
-    source, target, out = map(Path, words) if words else (*two_people(Path()), Path("posed.glb"))
+    source, target, out = map(Path, words) if words else (*two_people(FOLDER), FOLDER / "posed.glb")
     print(f"posing {target} like {source} ...", flush=True)
     posed = transfer(source, target)  # also: trimesh objects, or pairs (vertices, faces)
     posed.export(out)

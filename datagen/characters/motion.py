@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from datagen.characters.animation import Clip, read_clips
 from datagen.common.errors import BodyError, MeshError
+from datagen.common.printable import nearest
 from datagen.mesh.files import MeshFile
 from datagen.mesh.formats.glb import GlbContent, solid_nodes
 from datagen.mesh.formats.gltf import Gltf, reading
@@ -53,8 +54,8 @@ class Motion:
         content = file.content
         clips = _animations(content.gltf) if isinstance(content, GlbContent) else {}
         if animation not in clips:
-            there = listed(clips) or "none"
-            raise MeshError(f"{file.path} has no animation {animation!r} that moves a mesh; it has {there}")
+            near, there = nearest(animation, clips), listed(clips) or "none"
+            raise MeshError(f"{file.path} has no animation {animation!r} that moves a mesh{near}; it has {there}")
         found = cls(file, clips[animation], frames_per_second)
         if found.count > FRAME_LIMIT:
             raise MeshError(

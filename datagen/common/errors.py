@@ -14,6 +14,10 @@ class DsffnetError(Exception):
     exit_status = 1
 
 
+class DsffnetWarning(UserWarning):
+    """What a result may be poor for, where Python calls; a command prints it on standard error."""
+
+
 class RecipeError(DsffnetError):
     """A recipe or a command line that cannot mean anything (unknown key, wrong type, impossible value)."""
 

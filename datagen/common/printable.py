@@ -5,7 +5,9 @@ and half a surrogate pair (a byte of a file's name that is not UTF-8) cannot be 
 Python's escapes instead.
 """
 
+import difflib
 import re
+from collections.abc import Iterable
 
 _CONTROLS = r"\x00-\x1f\x7f-\x9f"
 _OVERRIDES = r"\u202a-\u202e\u2066-\u2069"
@@ -39,3 +41,10 @@ def counted(count: int, noun: str) -> str:
 
 def _escape(found: "re.Match[str]") -> str:
     return found[0].encode("unicode_escape").decode("ascii")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return words that suggest the known name nearest to one that is not, or none."""
+    by_letters = {each.casefold(): each for each in known}
+    close = difflib.get_close_matches(name.casefold(), by_letters, n=1, cutoff=0.5)
+    return f", did you mean {by_letters[close[0]]!r}?" if close else ""

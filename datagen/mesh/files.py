@@ -26,7 +26,7 @@ from datagen.common.files import write_atomically
 from datagen.mesh.formats import format_of
 from datagen.mesh.formats.surface import Content, Encoded, one_word
 from datagen.mesh.geometries import require_one_body
-from datagen.mesh.geometry import InFaces, Mesh, check_mesh
+from datagen.mesh.geometry import NEEDS_FACES, InFaces, Mesh, check_mesh
 from datagen.mesh.limits import DAMAGE, refuse_huge, require_file, require_known, require_thickness
 
 if TYPE_CHECKING:
@@ -60,11 +60,14 @@ class MeshFile:
         return self.content.geometries
 
 
-def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = (), is_body: bool = False) -> MeshFile:
+def read_mesh_file(
+    path: str | Path, *, geometries: Sequence[str] = (), is_body: bool = False, points: bool = False
+) -> MeshFile:
     """Read a mesh file (OBJ, PLY, GLB, OFF or STL) with all that is needed to write it again.
 
     ``geometries`` names those to take of a GLB scene, or groups and objects of an OBJ; by default all are one mesh. Of
     what is to be a body objects of an OBJ are refused that do not make one, as geometries of a GLB always are.
+    ``points``: an OBJ or a PLY without faces is taken, too.
 
     Raises
     ------
@@ -72,8 +75,8 @@ def read_mesh_file(path: str | Path, *, geometries: Sequence[str] = (), is_body:
         One line for whatever is wrong: no such file, unknown format, damage, no faces, numbers that are not finite,
         faces without vertices, no extent, no thickness, too many vertices, geometries that are not one body.
     """
-    read = _read(Path(path), geometries)
-    seen = InFaces.checked(read.mesh, name=str(path)).mesh
+    read = _read(Path(path), geometries, points=points)
+    seen = InFaces.checked(read.mesh, name=str(path), points=points).mesh
     require_thickness(np.asarray(seen.vertices, np.float64), read.path)
     if is_body and not geometries and read.path.suffix.lower() == ".obj":
         from datagen.mesh.formats.obj import ObjContent
@@ -107,11 +110,11 @@ def geometry_names(path: str | Path) -> tuple[str, ...]:
         return format_of(path.suffix.lower()).names(path)
 
 
-def _read(path: Path, geometries: Sequence[str]) -> MeshFile:
+def _read(path: Path, geometries: Sequence[str], *, points: bool = False) -> MeshFile:
     with _reading(path):
         content = format_of(path.suffix.lower()).read(path, geometries)
-        vertices, faces = content.vertices, _faces(content, path)
-    mesh = check_mesh(Mesh(vertices, faces), name=str(path))
+        vertices, faces = content.vertices, _faces(content, path, points=points)
+    mesh = check_mesh(Mesh(vertices, faces), name=str(path), points=points)
     return MeshFile(path, content.name or path.stem, mesh, content)
 
 
@@ -137,17 +140,16 @@ def _one_line(reason: object) -> str:
     return " ".join(str(reason).split())[:300]
 
 
-def _faces(content: Content, path: Path) -> NDArray[np.int64]:
+def _faces(content: Content, path: Path, *, points: bool) -> NDArray[np.int64]:
     surface = content.surface
     if surface.corners.size and not 0 <= surface.corners.min() <= surface.corners.max() < len(content.vertices):
         wrong = next(c for c in surface.corners.tolist() if not 0 <= c < len(content.vertices))
         raise MeshError(f"{path}: a face names vertex {wrong}, but there are {len(content.vertices)} (counted from 0)")
-    if not len(surface.faces):
-        what = (
-            f"{len(content.vertices):,} vertices and no faces (a point cloud?)" if len(content.vertices) else "no mesh"
-        )
-        raise MeshError(f"{path} holds {what}; pose transfer needs faces")
-    return surface.faces
+    if not len(content.vertices):
+        raise MeshError(f"{path} holds no mesh")
+    if not len(surface.faces) and not points:
+        raise MeshError(f"{path} holds {len(content.vertices):,} vertices and no faces (a point cloud?); {NEEDS_FACES}")
+    return surface.faces.reshape(-1, 3)
 
 
 def usable(original: MeshFile, vertices: NDArray[np.floating]) -> NDArray[np.float64]:

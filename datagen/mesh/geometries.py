@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, NotOneBodyError
+from datagen.common.printable import nearest
 
 CHOOSE = "--source-geometry NAME or --target-geometry NAME (again for more)"
 _REACH = 0.1  # of the longest edge of any box: geometries that are nearer than this belong together
-_FLAT = 1e-3  # of its own longest edge: what is flatter is ground or background
+_FLAT, _WIDE = 0.03, 0.3  # of its own longest edge: what is flatter, and wider, is ground or background
 _MOST = 1_000
 _NAMED = 12  # in a message
 
@@ -20,7 +21,7 @@ def require_known_names(wanted: Sequence[str], there: Iterable[str], path: Path,
     known = list(dict.fromkeys(there))
     for name in wanted:
         if name not in known:
-            raise MeshError(f"{path} has no {what} {name!r}; it has {listed(known) or 'none'}")
+            raise MeshError(f"{path} has no {what} {name!r}{nearest(name, known)}; it has {listed(known) or 'none'}")
 
 
 def require_few(names: Sequence[str], path: Path) -> None:
@@ -72,8 +73,7 @@ def _together(boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _is_ground(boxes: NDArray[np.float64], place: int) -> bool:
-    size = np.ptp(boxes[place], axis=0)
+    thick, wide, long = np.sort(np.ptp(boxes[place], axis=0))
     others = np.delete(boxes, place, axis=0)
-    return bool(
-        size.min() <= _FLAT * size.max() and size.max() > (others[:, 1].max(axis=0) - others[:, 0].min(axis=0)).max()
-    )
+    is_plate = thick <= _FLAT * long and wide >= _WIDE * long
+    return bool(is_plate and long > (others[:, 1].max(axis=0) - others[:, 0].min(axis=0)).max())

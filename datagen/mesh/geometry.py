@@ -24,6 +24,9 @@ class Mesh:
     faces: NDArray[np.integer]
 
 
+NEEDS_FACES = "a target needs triangles (reconstruct its surface); a source may be points"
+
+
 class InFaces:
     """A mesh as it is seen, without vertices that are a corner of no triangle, as exporters leave behind.
 
@@ -46,10 +49,10 @@ class InFaces:
             self.mesh = Mesh(mesh.vertices[self.rows], np.searchsorted(self.rows, kept))
 
     @classmethod
-    def checked(cls, mesh: Mesh, *, name: str) -> "InFaces":
+    def checked(cls, mesh: Mesh, *, name: str, points: bool = False) -> "InFaces":
         """Of a mesh that is usable, and is so without what is in no face; MeshError as :func:`check_mesh`."""
-        found = cls(check_mesh(mesh, name=name))
-        check_mesh(found.mesh, name=name)
+        found = cls(check_mesh(mesh, name=name, points=points))
+        check_mesh(found.mesh, name=name, points=points)
         return found
 
     def of_all(self, vertices: Floats) -> Floats:
@@ -208,19 +211,20 @@ def edges_of(faces: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], count), axis=1)
 
 
-def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
-    """Return the mesh if it is usable.
+def check_mesh(mesh: Mesh, *, name: str, points: bool = False) -> Mesh:
+    """Return the mesh if it is usable; ``points``: it may be points without faces.
 
     Raises
     ------
     MeshError
-        No vertices, no triangles, coordinates that are not finite, faces that index nothing, or no extent.
+        No vertices, no triangles where there must be some, coordinates that are not finite, faces that index nothing,
+        or no extent.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) == 0:
         raise MeshError(f"{name} has no usable vertices (shape {vertices.shape})")
-    if faces.size == 0:
-        raise MeshError(f"{name} has no faces (shape {faces.shape}); pose transfer needs a triangle mesh")
+    if faces.size == 0 and not points:
+        raise MeshError(f"{name} has no faces (shape {faces.shape}); {NEEDS_FACES}")
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"{name} has faces of shape {faces.shape}, not triangles [f, 3]: triangulate it")
     wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -230,7 +234,7 @@ def check_mesh(mesh: Mesh, *, name: str) -> Mesh:
             f"{name}: {are} not finite, the first is number {wrong[0]}, counted from 0, at "
             f"{vertices[wrong[0]].tolist()}. Repair or remove it"
         )
-    if faces.min() < 0 or faces.max() >= len(vertices):
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise MeshError(f"{name}: faces name vertex {faces.max()}, but there are {len(vertices)}")
     _require_extent(vertices, name)
     return mesh

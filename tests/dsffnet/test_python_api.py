@@ -12,7 +12,7 @@ import trimesh
 from datagen.mesh.files import load_mesh, save_mesh
 from datagen.mesh.geometry import Mesh
 from datagen.store import open_dataset
-from dsffnet import DsffnetError, transfer
+from dsffnet import DsffnetError, DsffnetWarning, transfer
 from dsffnet.posed import _of_python
 from tests.support.commands import ROOT
 from tests.support.recipes import tiny_training
@@ -70,8 +70,11 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
         ((good.vertices, good.faces + 0.5), "target: its faces are float64, not whole numbers"),
         ((good.vertices, np.ones((4, 3), bool)), "target: its faces are bool, not whole numbers"),
         ((good.vertices, np.zeros((5, 4), int)), r"target has faces of shape \(5, 4\), not triangles \[f, 3\]"),
-        ((good.vertices, []), "target has no faces"),
+        ((good.vertices, []), r"target has no faces \(shape \(0, 3\)\); a target needs triangles"),
     ]
+    posed = transfer((good.vertices, []), pose, model=run)
+    same = transfer(trimesh.PointCloud(good.vertices), pose, model=run)
+    assert np.array_equal(posed.vertices, same.vertices) and len(posed.vertices) == len(load_mesh(pose).vertices)
     for given, said in wrong:
         with pytest.raises(DsffnetError, match=said) as error:
             transfer(pose, given, model=run)
@@ -118,6 +121,13 @@ def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch,
     advice = "add --align, or --up=Z,Y --front=-Y,Z: or add --force; look at --picture"
     assert _of_python(advice) == "add align=True, or up='Z,Y', front='-Y,Z': or add force=True; look at it"
     assert _of_python("State --up=Z") == "State up='Z'"
+
+
+def test_what_is_doubtful_is_a_warning_that_code_can_see(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ball = trimesh.creation.icosphere(2)
+    with pytest.warns(DsffnetWarning, match="source .*The result may be poor"):
+        transfer(ball, run.parent / "person.ply", model=run)
+    assert not capsys.readouterr().err
 
 
 def test_a_scene_is_posed_as_one_body(run: Path) -> None:

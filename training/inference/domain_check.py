@@ -165,16 +165,20 @@ class Tears:
         ends = mesh.vertices[self._edges].astype(np.float64)
         return np.asarray(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
+    def lengths(self, posed: Mesh) -> Floats:
+        """Return the lengths [torn] of an output's torn edges, the target's longest extent being 1."""
+        after = self._lengths(posed)
+        return after[(after > _TORN_TIMES * self._before) & (after > _TORN_SHARE * self._size)] / self._size
+
     def in_output(self, posed: Mesh, *, name: str) -> str:
         """Return what to say of an output, called ``name``, in the target's unit; "" where it is not torn."""
-        after = self._lengths(posed)
-        torn = (after > _TORN_TIMES * self._before) & (after > _TORN_SHARE * self._size)
-        if not torn.any():
+        torn = self.lengths(posed)
+        if not len(torn):
             return ""
-        longest = after[torn].max() / self._size
+        edges = "one of its edges is" if len(torn) == 1 else f"{len(torn):,} of its edges are"
         return (
-            f"{name} comes out torn: {int(torn.sum()):,} of its edges are more than {_TORN_TIMES:g} times as long, the "
-            f"longest {longest:.0%} of the body, as when a skirt is moved with the legs; look at --picture"
+            f"{name} comes out torn: {edges} more than {_TORN_TIMES:g} times as long, the longest {torn.max():.0%} of "
+            "the body, as a skirt's between the legs; look at --picture, and try --model dressed, or --refine"
         )
 
 
@@ -206,7 +210,7 @@ def _about_standing(name: str, axes: Axes, way: Orientation, both: tuple[Axes, A
 
 def _about_parts(name: str, mesh: Mesh) -> Iterator[str]:
     sizes = part_sizes(mesh)
-    if sizes[0] <= _MAIN_SHARE * sizes.sum():
+    if len(mesh.faces) and sizes[0] <= _MAIN_SHARE * sizes.sum():
         yield (
             f"{name} has {len(sizes)} separate parts, the largest with {sizes[0] / sizes.sum():.0%} of the vertices: "
             "one body is posed as a whole; save it by itself, or choose it by --source-geometry or --target-geometry "

@@ -94,7 +94,8 @@ class PoseTransfer:
         Parameters
         ----------
         source, target
-            Meshes that may differ in vertices, faces, size and position. Vertices in no face are not read.
+            Meshes that may differ in vertices, faces, size and position; the source may be points without faces.
+            Vertices in no face are not read, where there are faces.
         source_axes, target_axes
             How each of them stands; by default as the network finds, where it can (`finds_standing`), else as the
             training data does, Y up and facing +Z.
@@ -114,7 +115,7 @@ class PoseTransfer:
         MeshError
             A mesh cannot be used; the message names which.
         """
-        check_mesh(source, name="source")
+        check_mesh(source, name="source", points=True)
         return next(self.sequence([source], target, source_axes=source_axes, target_axes=target_axes, refine=refine))
 
     def sequence(
@@ -249,7 +250,7 @@ class PoseTransfer:
         own = target.vertices @ self._turned_round(target.vertices, target_axes)  # its lean is of its pose, and goes
         posed = self._poser(Mesh(own, target.faces))
         for number, source in enumerate(sources):
-            mesh = InFaces.checked(source, name=f"source {number}").mesh
+            mesh = InFaces.checked(source, name=f"source {number}", points=True).mesh
             if number == 0:  # the others may turn round and bend
                 axes = axes or self.standing(mesh.vertices)
             assert axes is not None

@@ -116,9 +116,9 @@ def generate_command(options: argparse.Namespace) -> None:
       dsffnet generate --recipe data/custom.zarr --out data/custom-again.zarr
     """
     from datagen.generate import generate
-    from workflows.recipe.loader import load_recipe
+    from workflows.recipe.loader import load_section
 
-    recipe = load_recipe(options.recipe, options.set).data
+    recipe = load_section(options.recipe, options.set, "data")
     with _runner(options, recipe, anew=options.fresh) as how:
         made = generate(recipe, options.out, fresh=options.fresh, **how)
     _show(made)

@@ -4,11 +4,12 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from itertools import chain
 
+from datagen.common.printable import nearest
 from workflows.cli import avatar, data, demo, runs, skin, studies, submit, transfer, ui
 from workflows.pipeline.console import guarded
-from workflows.recipe.names import nearest
 
 _AXES = re.compile(r"-[XYZxyz](,-?[XYZxyz])?")
 _GROUPS = {
@@ -41,6 +42,7 @@ def parsed(words: Sequence[str]) -> argparse.Namespace:
         epilog=_listed(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    made.add_argument("--version", action="version", version=f"%(prog)s {version('dsffnet')}")
     commands = made.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog=made.prog)
     known = {command.name: command for command in chain.from_iterable(_GROUPS.values())}
     if words and not words[0].startswith("-") and words[0] not in known:

@@ -39,9 +39,9 @@ def train_command(options: argparse.Namespace) -> None:
     from workflows.pipeline.run_folder import RunFolder
     from workflows.pipeline.tasks import TaskRunner
     from workflows.pipeline.train import check_run_accepts, train_model
-    from workflows.recipe.loader import load_recipe
+    from workflows.recipe.loader import load_section
 
-    recipe = load_recipe(options.recipe, options.set).training
+    recipe = load_section(options.recipe, options.set, "training")
     run = RunFolder(Path(require_reachable(options.out, option="--out")))
     run.require_kind()
     data = require_reachable(options.data, option="--data", urls=True)
@@ -81,9 +81,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
     from workflows.pipeline.ray_cluster import require_reachable
     from workflows.pipeline.tasks import TaskRunner
     from workflows.pipeline.weights_argument import evaluated, projecting
-    from workflows.recipe.loader import load_recipe
+    from workflows.recipe.loader import load_section
 
-    recipe = load_recipe(options.recipe, options.set).evaluation
+    recipe = load_section(options.recipe, options.set, "evaluation")
     place = Path(require_reachable(options.run, option="RUN"))
     home, data = evaluated(place, options.checkpoint).home, require_reachable(options.data, option="--data", urls=True)
     open_dataset(data)

@@ -158,13 +158,14 @@ def submitted(entrypoint: list[str], address: str | None, working_dir: str) -> R
     ClusterError
         The cluster cannot be reached, or refused it.
     """
+    from ray.exceptions import RayError
     from ray.job_submission import JobSubmissionClient
     from requests import RequestException
 
     try:
         client = JobSubmissionClient(address)
         name = client.submit_job(entrypoint=shlex.join(entrypoint), runtime_env={"working_dir": working_dir})
-    except (RuntimeError, ValueError, OSError, RequestException) as error:
+    except (RuntimeError, ValueError, OSError, RequestException, RayError) as error:
         raise ClusterError(
             f"the job could not be submitted to {address or 'the cluster of RAY_API_SERVER_ADDRESS'}: "
             f"{first_line_of(error)}"

@@ -1,12 +1,14 @@
 """Which weights a person means by a path, and where their evaluation goes."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from datagen.common.errors import CheckpointError
 from datagen.common.files import resolve_within
-from workflows.pretrained import own_names, weights_named
+from datagen.common.printable import nearest
+from workflows.pretrained import own_names, own_weights, weights_named
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is wrong with files is said before
     from datagen.store import Dataset
@@ -51,6 +53,11 @@ def evaluated(place: Path, which: "Which" = "result") -> Evaluated:
     """
     from training.checkpoints.checkpoint import require_checkpoint
 
+    if place.name in own_names() and not place.exists():
+        raise CheckpointError(
+            f"{place} is not there. Copy the weights of that name, which come along, as results are written beside "
+            f"them: cp -r {shlex.quote(str(own_weights(place.name)))} {shlex.quote(str(place))}"
+        )
     checkpoint, step = require_checkpoint(place, which, weights_only=True), _step_folder(place)
     if step is not None:
         return Evaluated(checkpoint, step.parent.parent, f"step-{checkpoint.step}")
@@ -74,7 +81,8 @@ def weights_called(name: str, *, option: str) -> Path:
     if not name or not place.exists():
         known = ", ".join(own_names())
         raise CheckpointError(
-            f"{option} {name or repr(name)}: there is no such run or weights. Name one; these come along: {known}"
+            f"{option} {name or repr(name)}: there is no such run or weights{nearest(name, own_names())}. Name one; "
+            f"these come along: {known}"
         )
     return place
 

@@ -10,13 +10,14 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from datagen.common.errors import RecipeError
+from datagen.common.printable import nearest
 from datagen.recipe import ANIMALS, PART_KINDS, DatasetRecipe, Frozen
 from datagen.recipe import PATH_KEYS as DATA_PATH_KEYS
 from datagen.recipe.text import Words, changed, fault_text, faults_text, parse_words, read_values, require_plain, shown
 from training.recipes.networks import DEFAULT_NETWORK, AvatarRecipe, TemplateRecipe
 from training.recipes.training import PATH_KEYS as TRAINING_PATH_KEYS
 from training.recipes.training import EvaluationRecipe, TrainingRecipe
-from workflows.recipe.names import known_recipes, known_trainings, named_training, nearest
+from workflows.recipe.names import known_recipes, known_trainings, named_training
 
 
 def with_absolute_paths(values: Any, folder: Path) -> Any:
@@ -199,6 +200,28 @@ _KINDS = (
 """Sections of which there are several kinds, the key that says which, and which it is where that key is left out."""
 
 
+def load_section(name_or_file: str, words: Sequence[str], section: str) -> Any:
+    """The section of a recipe that a command takes; words that change another one are refused, as they change nothing.
+
+    Raises
+    ------
+    RecipeError
+        As :func:`load_recipe`; or a word is of another section.
+    """
+    recipe = load_recipe(name_or_file, words)
+    for key, _ in parse_words(words, option="--set "):
+        if key.split(".")[0] != section:
+            raise RecipeError(f"--set {key} changes nothing here: {_TAKES[section]}. Leave it out")
+    return getattr(recipe, section)
+
+
+_TAKES = {
+    "data": "what is made goes by data alone; give the key to the command that trains or measures",
+    "training": "--data is taken as it was made, and what is learned goes by training alone",
+    "evaluation": "--data and the weights are taken as they were made, and what is measured goes by evaluation alone",
+}
+
+
 def _find(name_or_file: str) -> Path | dict[str, Any]:
     """The file of a recipe, or the recipe that is stored with a dataset."""
     known = known_recipes()
@@ -232,16 +255,24 @@ def _describe(fault: Any, listed: set[str] | None, model: type[BaseModel]) -> st
         known = [line.split()[0] for line in describe_fields(model)]
         if key.startswith("beside."):
             known = [f"beside.{name.removeprefix('training.')}" for name in known if name.startswith("training.")]
-        section, keys = key.rpartition(".")[0], ""
+        section, keys, names = key.rpartition(".")[0], "", _names_in(location, model)
         if listed is not None and section not in listed:
             listed.add(section)
-            keys = _its_keys(location, section, model)
+            keys = f" ({section or 'a recipe'} has {', '.join(names)})"
         if any(name == key or name.startswith(f"{key}.") for name in known):
             having = _members(section, having=location[-1])
             whose = f"of {', '.join(having)}" if having else f"of another kind of {section!r}"
             return f"{key!r} is a key {whose}, not of the one chosen{keys}"
-        return f"unknown key {shown(key)}{nearest(key, known)}{keys}"
+        own = [".".join(filter(None, (section, name))) for name in names]
+        return f"unknown key {shown(key)}{nearest(key, own) or _of_another_section(key, known)}{keys}"
     return fault_text(fault, key=key)
+
+
+def _of_another_section(key: str, known: Sequence[str]) -> str:
+    """Words that suggest where a key of that name is, or the known key that is nearest to it."""
+    every = [".".join(name.split(".")[:upto]) for name in known for upto in range(1, name.count(".") + 2)]
+    alike = [name for name in every if name.endswith(f".{key.rpartition('.')[2]}")]
+    return nearest(key, alike) or nearest(key, known)
 
 
 def _is_one_of_several(section: str, place: str) -> bool:
@@ -249,16 +280,15 @@ def _is_one_of_several(section: str, place: str) -> bool:
     return place in _UNIONS or (section in ("bodies", "parts") and place.isdigit())
 
 
-def _its_keys(location: list[str], section: str, model: type[BaseModel]) -> str:
-    """Words that list the keys of the section of an unknown key, of the kind that was chosen; ``location`` names it."""
+def _names_in(location: list[str], model: type[BaseModel]) -> list[str]:
+    """The keys of the section of an unknown key, of the kind that was chosen; ``location`` names it."""
     models: list[type[BaseModel]] = [model]
     for part in location[:-1]:
         chosen = [model for model in models if part in (field.default for field in model.model_fields.values())]
         fields = [model.model_fields[part] for model in models if part in model.model_fields]
         inner = [kind for field in fields for kind in _parts(field.annotation) if hasattr(kind, "model_fields")]
         models = chosen or inner or models
-    keys = dict.fromkeys(name for model in models for name in model.model_fields)
-    return f" ({section or 'a recipe'} has {', '.join(keys)})"
+    return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 
 def _parts(annotation: Any) -> Iterator[Any]:

@@ -1,10 +1,10 @@
 """The recipes and training recipes that come with the project, by name."""
 
-import difflib
 from pathlib import Path
 from typing import Any
 
 from datagen.common.errors import RecipeError
+from datagen.common.printable import nearest
 from datagen.recipe.text import read_values
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
@@ -54,9 +54,3 @@ def named_training(name: str) -> dict[str, Any]:
     if name not in known:
         raise RecipeError(f"no training recipe {name!r}{nearest(name, list(known))}; there are {', '.join(known)}")
     return dict(read_values(known[name])["training"])
-
-
-def nearest(name: str, known: list[str]) -> str:
-    """Words that suggest the known name nearest to one that is not, or none."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    return f", did you mean {close[0]!r}?" if close else ""

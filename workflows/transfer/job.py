@@ -127,7 +127,7 @@ class TransferJob:
         """The source, or a frame of the sequence."""
         if self.animation is not None:
             return replace(self._motion.file, mesh=self._motion.mesh(number))
-        return read_mesh_file(self.sources[number], geometries=self.source_geometry, is_body=True)
+        return read_mesh_file(self.sources[number], geometries=self.source_geometry, is_body=True, points=True)
 
     @cached_property
     def _motion(self) -> Motion:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, storage_errors
-from datagen.mesh.files import MeshFile, write_posed
+from datagen.mesh.files import MeshFile, load_mesh, write_posed
 from datagen.mesh.geometry import InFaces, Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import Tears, about_loose, remarks, seen_by
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from training.viz.transfer_example import Comparison, NamedMesh
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
+_ROUNDED = 1e-4  # of the body's longest extent: by so much a file may round coordinates
+_POINTS_SHOWN = 10_000  # of a source without faces
 _VOTING_FRAMES = 3  # of a sequence, on how it stands
 
 
@@ -189,6 +191,8 @@ class TransferWork:
         written = write_posed(self.target, posed.vertices, out, beside=beside)
         if written.left_out and beside:
             warn(f"{out.name} does not keep: {'; '.join(written.left_out)}")
+        if beside and (line := _about_rounding(posed, out)):
+            self._warn(line)
         return written.files
 
     def posed(self) -> Iterator[Mesh]:
@@ -263,7 +267,8 @@ class TransferWork:
             write_viewer(transfers, job.beside(".html"), title="Pose transfer")
 
     def _place(self, number: int) -> Path:
-        return self.job.frame_file(number) if self.job.is_sequence else self.job.out
+        job = self.job
+        return job.frame_file(number) if job.is_sequence and not job.is_file else job.out
 
     def _sequence(self, target: "NamedMesh") -> "Comparison":
         """All frames that the page plays, as one transfer that moves."""
@@ -308,10 +313,28 @@ def _look(file: MeshFile) -> "Look | None":
 
 
 def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None") -> "NamedMesh":
-    from training.viz.transfer_example import NamedMesh  # pictures alone need it
+    from training.viz.mesh_grid import drawable  # pictures alone need these
+    from training.viz.transfer_example import NamedMesh
 
+    if not len(mesh.faces):
+        some = np.linspace(0, len(mesh.vertices) - 1, min(len(mesh.vertices), _POINTS_SHOWN)).astype(int)
+        mesh, look = drawable(Mesh(mesh.vertices[some], mesh.faces)), None
     fits = look is not None and look.fits(len(mesh.vertices), len(mesh.faces))
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name, look if fits else None)
+
+
+def _about_rounding(posed: Mesh, out: Path) -> str:
+    """What to say of a mesh so far from the origin that its file's numbers are too short for it; "" of any other."""
+    size, far = float(np.ptp(posed.vertices, axis=0).max()), float(np.abs(posed.vertices).max())
+    if np.spacing(np.float32(far)) <= _ROUNDED * size:
+        return ""
+    off = float(np.abs(load_mesh(out).vertices - posed.vertices).max())
+    if off <= _ROUNDED * size:
+        return ""
+    return (
+        f"{out} is rounded by up to {off:.2g}, {off / size:.1%} of the body, as its coordinates reach {far:,.0f}: move "
+        "the target near the origin"
+    )
 
 
 def _move(path: Path, place: Path, *, is_own: bool) -> None:

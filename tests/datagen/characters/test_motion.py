@@ -144,8 +144,10 @@ def test_morph_targets_as_this_project_writes_them(tmp_path: Path) -> None:
 
 def test_an_animation_that_is_not_there_or_moves_no_mesh(tmp_path: Path) -> None:
     path = nodding(tmp_path / "a.glb")
-    with pytest.raises(MeshError, match=r"a\.glb has no animation 'Run'.*it has 'Nod', 'Kick'"):
+    with pytest.raises(MeshError, match=r"a\.glb has no animation 'Run' that moves a mesh; it has 'Nod', 'Kick'"):
         motion(path, "Run")
+    with pytest.raises(MeshError, match=r"no animation 'nod' that moves a mesh, did you mean 'Nod'\?; it has"):
+        motion(path, "nod")
     rig = Rig()
     rig.clips["Nod"] = {"Neck": rig.keys("Neck", [NONE, about("x", 60)], SECOND)}
     document = rig.document()

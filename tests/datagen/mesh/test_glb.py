@@ -202,8 +202,11 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
     assert read_mesh_file(tmp_path / "box.glb").name == "other"
     assert read_mesh_file(path, geometries=["other", "body"]).geometries == ("body", "other")  # in the file's order
     assert read_mesh_file(two(tmp_path, (1.6, 0, 0), trimesh.creation.box())).geometries == ("body", "other")
-    with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
-        read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box((9, 0, 9))))
+    for ground in ((9, 0, 9), (4, 0.02, 4), (2.5, 0.05, 2.5)):
+        with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
+            read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box(ground)))
+    staff = read_mesh_file(two(tmp_path, (0, 0, 0.5), trimesh.creation.box((0.03, 3, 0.03))))
+    assert staff.geometries == ("body", "other")
 
 
 def test_too_many_geometries_are_refused_before_any_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from tests.support.recipes import PARTS, tiny_training
 from training.checkpoints.checkpoint import export_weights, require_checkpoint
 from training.engine.trainer import train
 from training.recipes.training import EvaluationRecipe
-from training.tracking.record import read_record
+from training.tracking.record import begin_record, read_record
 from workflows.cli.declare import which_checkpoint
 from workflows.pipeline.evaluate import evaluate_weights
 from workflows.pipeline.run_folder import RunFolder
@@ -87,7 +87,7 @@ def test_a_training_without_a_record_may_be_begun_afresh(workflow: Path) -> None
 def test_the_driver_says_where_meshes_were_kept(
     tmp_path: Path, dataset: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "run").mkdir()
+    begin_record(tmp_path / "run", name="train", kind="train", parent=None, parameters={})
     (tmp_path / "run" / "input.json").write_text('{"where": "memory (1 MB)"}')
     train_model(tiny_training(), dataset, RunFolder(tmp_path / "run"), parent=None, tasks=TaskRunner())
     assert "train: meshes were kept in " in capsys.readouterr().out

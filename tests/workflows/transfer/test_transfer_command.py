@@ -404,7 +404,6 @@ UNUSABLE: dict[str, tuple[NDArray[np.floating], NDArray[np.integer], str]] = {
     "not a number": (np.where(np.arange(COUNT)[:, None] == 5, np.nan, ROUND), TRIANGLES, "the first is number 5"),
     "infinite": (np.where(np.arange(COUNT)[:, None] == 5, np.inf, ROUND), TRIANGLES, "the first is number 5"),
     "one face, and points": (ROUND, TRIANGLES[:1], "all vertices lie in one slanted plane"),
-    "no faces": (ROUND, TRIANGLES[:0], "holds 42 vertices and no faces"),
     "a face beyond the last vertex": (ROUND, np.array([[0, 1, 99]]), "vertex 100, but there are 42"),
     "too large to be squared": (ROUND * 1e200, TRIANGLES, r"coordinates up to 1e\+200: scale it"),
     "too small to be squared": (ROUND * 1e-200, TRIANGLES, "long at most: scale it"),
@@ -442,6 +441,20 @@ def test_unusable_meshes_are_one_line_before_any_work(
     with pytest.raises(MeshError, match=says) as caught:
         transfer(*((bad, "person.obj") if role == "source" else ("pose.obj", bad)), "-o", tmp_path / "x.obj")
     assert "\n" not in str(caught.value) and str(bad) in str(caught.value) and files(tmp_path) == ["bad.obj"]
+
+
+def test_a_source_may_be_points_and_a_target_needs_faces(transfer: Transfer, tmp_path: Path) -> None:
+    points = written_obj(tmp_path / "scan.obj", ROUND, TRIANGLES[:0])
+    cloud = tmp_path / "scan.ply"
+    trimesh.PointCloud(ROUND).export(cloud)
+    for number, scan in enumerate((points, cloud)):
+        transfer(scan, "person.obj", "-o", tmp_path / f"{number}.obj", "--picture", "--viewer")
+        assert len(load_mesh(tmp_path / f"{number}.obj").vertices) == len(load_mesh("person.obj").vertices)
+        assert (tmp_path / f"{number}.png").stat().st_size and (tmp_path / f"{number}.html").stat().st_size
+        with pytest.raises(
+            MeshError, match=r"42 vertices and no faces .*; a target needs triangles .*source may be po"
+        ):
+            transfer("pose.obj", scan, "-o", tmp_path / "x.obj")
 
 
 def test_memory_that_runs_out_is_one_line_about_the_meshes(
