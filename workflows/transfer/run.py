@@ -201,6 +201,7 @@ class TransferWork:
         for number, posed in enumerate(self._frames(), 1):
             if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
                 is_torn = True
+                line += ", or --model dressed" if self.by == "human" else ""
                 self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
             yield posed
 
