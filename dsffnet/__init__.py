@@ -6,6 +6,7 @@
 """
 
 import os
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from datagen.common.errors import DsffnetError, DsffnetWarning
@@ -34,8 +35,9 @@ def transfer(
     source, target
         The mesh in the wanted pose and the mesh of the wanted identity, each a path (OBJ, PLY, GLB, OFF, STL), an
         object with ``vertices`` and ``faces`` such as a ``trimesh.Trimesh``, a ``trimesh.Scene`` whose geometries make
-        one body, or a pair (vertices [n, 3], triangles [f, 3]). They may differ in vertices, faces, size and place, and
-        are not changed.
+        one body, or a pair (vertices [n, 3], triangles [f, 3]). The source may be points: an OBJ or a PLY without
+        faces, a ``trimesh.PointCloud``, an array [n, 3]. They may differ in vertices, faces, size and place, and are
+        not changed.
     model
         A run folder, weights, ``models:/NAME@ALIAS`` (of the server MLFLOW_TRACKING_URI), or the name of weights that
         come along; by default `human`, `dressed` or `animals`, by the meshes.
@@ -66,4 +68,7 @@ def transfer(
     """
     from dsffnet.posed import Options, posed
 
-    return posed(source, target, Options(model, refine, align, up, front, force))
+    found = posed(source, target, Options(model, refine, align, up, front, force))
+    for doubt in found.doubts:
+        warnings.warn(doubt, DsffnetWarning, stacklevel=2)
+    return found

@@ -31,12 +31,13 @@ NO_FACES = np.empty((0, 3), np.int64)
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """The target's faces [f, 3], and its vertices [n, 3] float64 in the source's pose."""
+    """The target's faces [f, 3], its vertices [n, 3] float64 in the source's pose, and what was warned of."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     job: TransferJob = field(repr=False)
     target: MeshFile = field(repr=False)
+    doubts: tuple[str, ...] = field(default=(), repr=False)
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write a mesh file; the suffix tells the format, and what the target's file has beside positions stays.
@@ -49,8 +50,9 @@ class PosedMesh:
         job = replace(self.job, out=Path(path))
         with _in_words_of_python():
             job.check_places()
-            for line in write_posed(self.target, self.vertices, job.out).left_out:
-                _warn(line)
+            left_out = write_posed(self.target, self.vertices, job.out).left_out
+        for line in left_out:
+            warnings.warn(printable(f"{job.out.name} does not keep: {line}"), DsffnetWarning, stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def posed(source: Any, target: Any, options: Options) -> PosedMesh:
 
 def _posed(source: Any, target: Any, options: Options) -> PosedMesh:
     read = [_mesh_file(given, role) for given, role in ((source, "source"), (target, "target"))]
-    job = _job(read, options)
+    job, doubts = _job(read, options), list[str]()
     with weights_of(options.weights) as weights:
         work = TransferWork.of(
             job,
@@ -90,14 +92,11 @@ def _posed(source: Any, target: Any, options: Options) -> PosedMesh:
             first=read[0].mesh,
             target=read[1],
             force=options.force,
-            warn=_warn,
+            warn=lambda line: doubts.append(printable(_of_python(line))),
         )
         found = next(work.posed())
-    return PosedMesh(np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64), job, read[1])
-
-
-def _warn(line: str) -> None:
-    warnings.warn(printable(_of_python(line)), DsffnetWarning, stacklevel=2)
+    vertices, faces = np.asarray(found.vertices, np.float64), read[1].mesh.faces.astype(np.int64)
+    return PosedMesh(vertices, faces, job, read[1], tuple(doubts))
 
 
 _OF_PYTHON = {
@@ -164,8 +163,7 @@ def _mesh(given: Any, role: str) -> Mesh:
     if hasattr(given, "graph") and hasattr(given, "geometry"):
         return _whole(given, role)
     try:
-        both = (given.vertices, getattr(given, "faces", NO_FACES)) if hasattr(given, "vertices") else given
-        vertices, faces = (np.array(each) for each in both)
+        vertices, faces = (np.array(NO_FACES if each is None else each) for each in _both(given))
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # the last of a tensor with a gradient
         raise MeshError(
             f"{role} is a {type(given).__name__}; give a path, an object with vertices [n, 3] and faces [f, 3], or a "
@@ -177,6 +175,15 @@ def _mesh(given: Any, role: str) -> Mesh:
             raise MeshError(f"{role}: its {what} are {array.dtype}, not {wanted}")
     faces = faces.reshape(-1, 3) if not faces.size else faces
     return Mesh(vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False))
+
+
+def _both(given: Any) -> Any:
+    """Vertices and triangles of what has both or vertices alone, or of a pair; of an array [n, 3] its points."""
+    if isinstance(given, np.ndarray) and given.ndim == 2:
+        return given, None
+    if not hasattr(given, "vertices"):
+        return given
+    return given.vertices, getattr(given, "faces", getattr(given, "triangles", None))
 
 
 def _whole(scene: Any, role: str) -> Mesh:

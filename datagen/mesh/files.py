@@ -118,6 +118,10 @@ def _read(path: Path, geometries: Sequence[str], *, points: bool = False) -> Mes
     return MeshFile(path, content.name or path.stem, mesh, content)
 
 
+_DIGITS, _ROUNDED = 8, 1e-4
+"""Digits of numbers in text files after the first; share of a mesh' longest extent by which its file may round."""
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Whatever is wrong with a file as MeshError, in one line."""
@@ -196,7 +200,19 @@ def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *
         else:
             left_out.append(f"{name}: another file of that name is in {out.parent} and was left as it is")
     write_atomically(out, made.content)
-    return Written([*files, out], list(dict.fromkeys(left_out)))
+    return Written([*files, out], list(dict.fromkeys([*left_out, *lost_digits(np.asarray(vertices), out)])))
+
+
+def lost_digits(vertices: NDArray[np.floating], out: Path) -> list[str]:
+    """What to say where numbers of a file are too short for vertices [n, 3] that far from the origin; else nothing."""
+    far, size = float(np.abs(vertices).max()), float(np.ptp(vertices, axis=0).max())
+    if out.suffix.lower() in (".obj", ".off"):
+        off = 0.5 * 10.0 ** (np.floor(np.log10(max(far, 1e-300))) - _DIGITS)
+    else:
+        off = float(np.spacing(np.float32(far))) / 2
+    if off <= _ROUNDED * size:
+        return []
+    return [f"positions to better than {off:.1g}, as coordinates reach {far:,.0f} (move the target near the origin)"]
 
 
 def _encoded(original: MeshFile, vertices: NDArray[np.float64], out: Path) -> Encoded:

@@ -11,7 +11,7 @@ from datagen.common.printable import nearest
 
 CHOOSE = "--source-geometry NAME or --target-geometry NAME (again for more)"
 _REACH = 0.1  # of the longest edge of any box: geometries that are nearer than this belong together
-_FLAT, _WIDE = 0.03, 0.3  # of its own longest edge: what is flatter, and wider, is ground or background
+_FLAT, _PLATE = 1e-3, 0.03  # of its own longest edge: what is flatter is ground or background, or a plate, which may be
 _MOST = 1_000
 _NAMED = 12  # in a message
 
@@ -73,7 +73,10 @@ def _together(boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _is_ground(boxes: NDArray[np.float64], place: int) -> bool:
-    thick, wide, long = np.sort(np.ptp(boxes[place], axis=0))
-    others = np.delete(boxes, place, axis=0)
-    is_plate = thick <= _FLAT * long and wide >= _WIDE * long
-    return bool(is_plate and long > (others[:, 1].max(axis=0) - others[:, 0].min(axis=0)).max())
+    size, others = np.ptp(boxes[place], axis=0), np.delete(boxes, place, axis=0)
+    low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
+    if size.max() <= (high - low).max():
+        return False
+    thin, middle = int(size.argmin()), boxes[place].mean(axis=0)
+    stands_on_it = high[thin] - low[thin] >= 0.5 * (high - low).max() and not low[thin] < middle[thin] < high[thin]
+    return bool(size.min() <= (_PLATE if stands_on_it else _FLAT) * size.max())

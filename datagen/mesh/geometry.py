@@ -24,7 +24,7 @@ class Mesh:
     faces: NDArray[np.integer]
 
 
-NEEDS_FACES = "a target needs triangles (reconstruct its surface); a source may be points"
+NEEDS_FACES = "triangles are needed; only the source of dsffnet transfer may be points (an OBJ or a PLY without faces)"
 
 
 class InFaces:

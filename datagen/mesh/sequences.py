@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError
-from datagen.mesh.files import MeshFile, check_writable, draft_of, usable
+from datagen.mesh.files import MeshFile, check_writable, draft_of, lost_digits, usable
 from datagen.mesh.formats import FORMATS
 from datagen.mesh.limits import FRAME_LIMIT, GLB_LIMIT
 
@@ -111,4 +111,4 @@ def write_animation(
     sound = (usable(original, frame) for frame in frames)
     draft, left_out = draft_of(original)
     draft.animated(sound, out, frames_per_second=frames_per_second)
-    return left_out
+    return [*left_out, *lost_digits(original.mesh.vertices, out)]

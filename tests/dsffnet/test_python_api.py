@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,7 +59,6 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
     pose, good = run.parent / "pose.ply", load_mesh(run.parent / "person.ply")
     flat = good.vertices * [1, 1, 0]
     wrong = [
-        (good.vertices, "target is a ndarray; give a path, an object with vertices"),
         ((good.vertices, [[0, 1, 10**6]]), "target: faces name vertex 1000000, but there are"),
         ((good.vertices * np.nan, good.faces), "target: .* vertices are not finite"),
         ((flat, good.faces), "target is flat: it has no thickness along z"),
@@ -70,11 +70,9 @@ def test_one_line_for_whatever_is_wrong(run: Path, tmp_path: Path) -> None:
         ((good.vertices, good.faces + 0.5), "target: its faces are float64, not whole numbers"),
         ((good.vertices, np.ones((4, 3), bool)), "target: its faces are bool, not whole numbers"),
         ((good.vertices, np.zeros((5, 4), int)), r"target has faces of shape \(5, 4\), not triangles \[f, 3\]"),
-        ((good.vertices, []), r"target has no faces \(shape \(0, 3\)\); a target needs triangles"),
+        ((good.vertices, []), r"target has no faces \(shape \(0, 3\)\); triangles are needed"),
+        (np.array(good.vertices), r"target has no faces"),
     ]
-    posed = transfer((good.vertices, []), pose, model=run)
-    same = transfer(trimesh.PointCloud(good.vertices), pose, model=run)
-    assert np.array_equal(posed.vertices, same.vertices) and len(posed.vertices) == len(load_mesh(pose).vertices)
     for given, said in wrong:
         with pytest.raises(DsffnetError, match=said) as error:
             transfer(pose, given, model=run)
@@ -123,11 +121,25 @@ def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch,
     assert _of_python("State --up=Z") == "State up='Z'"
 
 
+def test_a_source_may_be_points(run: Path) -> None:
+    pose, good = run.parent / "pose.ply", load_mesh(run.parent / "person.ply")
+    expected = transfer((good.vertices, good.faces), pose, model=run).vertices  # this network sees vertices alone
+    layout = SimpleNamespace(vertices=good.vertices, triangles=good.faces)
+    for points in (
+        (good.vertices, []),
+        (good.vertices, None),
+        trimesh.PointCloud(good.vertices),
+        good.vertices,
+        layout,
+    ):
+        np.testing.assert_allclose(transfer(points, pose, model=run).vertices, expected, atol=1e-6)
+
+
 def test_what_is_doubtful_is_a_warning_that_code_can_see(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ball = trimesh.creation.icosphere(2)
     with pytest.warns(DsffnetWarning, match="source .*The result may be poor"):
-        transfer(ball, run.parent / "person.ply", model=run)
-    assert not capsys.readouterr().err
+        posed = transfer(ball, run.parent / "person.ply", model=run)
+    assert posed.doubts and not capsys.readouterr().err
 
 
 def test_a_scene_is_posed_as_one_body(run: Path) -> None:

@@ -178,7 +178,7 @@ class Tears:
         edges = "one of its edges is" if len(torn) == 1 else f"{len(torn):,} of its edges are"
         return (
             f"{name} comes out torn: {edges} more than {_TORN_TIMES:g} times as long, the longest {torn.max():.0%} of "
-            "the body, as a skirt's between the legs; look at --picture, and try --refine"
+            "the body, as a skirt's between the legs; look at --picture"
         )
 
 

@@ -169,24 +169,34 @@ class RunFolder(_Folder):
     lock = _file(".driver.lock", kept=True)
 
     def remove(self) -> None:
-        """Remove what a training keeps in its folder; RecipeError where that holds none (:meth:`require_kind`)."""
-        self.require_kind()
+        """Remove what a training keeps in its folder.
+
+        Raises
+        ------
+        RecipeError
+            The folder is not a training run's.
+        """
+        if any(not _matches(path, self.kept) for path in self._entries()) and not self._is_training():
+            raise RecipeError(
+                f"{self.path} is not the folder of a training, so --fresh leaves it alone. Choose another --out"
+            )
         super().remove()
 
     def require_kind(self) -> None:
-        """Refuse, beside what :meth:`_Folder.require_kind` does, a folder that holds files, but no training of ours."""
+        """Refuse, beside what :meth:`_Folder.require_kind` does, files of others that a training would replace."""
         super().require_kind()
-        others = [path.name for path in self._entries() if not _matches(path, self.kept)]
-        if others and not self._is_training() and not any(name.startswith(self.record.name) for name in others):
-            raise RecipeError(
-                f"{self.path} holds files, but no training of ours ({others[0]}), which might be replaced. "
-                "Choose a folder that is empty or new"
-            )
+        if not self._is_training():
+            replaced = [path.name for path in self.owned() if not _matches(path, self.kept)]
+            if replaced and not (self.path / self.record.name).exists():
+                raise RecipeError(
+                    f"{self.path} is not the folder of a training, and holds {replaced[0]}, which one would replace. "
+                    "Choose another --out"
+                )
 
     def _is_training(self) -> bool:
         """By its record, or, where torchrun trained without a workflow, by what every training writes."""
         record = read_record(self.path)
-        return record.kind == "train" if record else self.checkpoints.is_dir() and self.journal.is_file()
+        return record.kind == "train" if record else self.journal.is_file()
 
 
 class WorkflowFolder(_Folder):

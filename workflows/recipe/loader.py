@@ -1,5 +1,6 @@
 """The recipe of a whole workflow: its sections, overrides, and errors a person can act on."""
 
+import difflib
 import os
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -263,16 +264,17 @@ def _describe(fault: Any, listed: set[str] | None, model: type[BaseModel]) -> st
             having = _members(section, having=location[-1])
             whose = f"of {', '.join(having)}" if having else f"of another kind of {section!r}"
             return f"{key!r} is a key {whose}, not of the one chosen{keys}"
-        own = [".".join(filter(None, (section, name))) for name in names]
-        return f"unknown key {shown(key)}{nearest(key, own) or _of_another_section(key, known)}{keys}"
+        return f"unknown key {shown(key)}{_nearest_key(key, names, known)}{keys}"
     return fault_text(fault, key=key)
 
 
-def _of_another_section(key: str, known: Sequence[str]) -> str:
-    """Words that suggest where a key of that name is, or the known key that is nearest to it."""
+def _nearest_key(key: str, names: Sequence[str], known: Sequence[str]) -> str:
+    """Words that suggest a key of the section, which has ``names``; one of that name elsewhere; or any that is near."""
+    section, _, last = key.rpartition(".")
+    if close := difflib.get_close_matches(last, names, n=1, cutoff=0.6):
+        return f", did you mean {'.'.join(filter(None, (section, close[0])))!r}?"
     every = [".".join(name.split(".")[:upto]) for name in known for upto in range(1, name.count(".") + 2)]
-    alike = [name for name in every if name.endswith(f".{key.rpartition('.')[2]}")]
-    return nearest(key, alike) or nearest(key, known)
+    return nearest(key, [name for name in every if name.split(".")[-1] == last]) or nearest(key, known)
 
 
 def _is_one_of_several(section: str, place: str) -> bool:

@@ -136,6 +136,9 @@ class Study(ABC, Generic[RowType]):
     weights: Sequence[Evaluated]
     settings: dict[str, Any]
 
+    def prepare(self) -> None:
+        """Make what is measured, in the folder, which nobody else writes to meanwhile; `settings` may wait for it."""
+
     @abstractmethod
     def measure(self, done: list[RowType]) -> Iterable[list[RowType]]:
         """Rows that ``done`` lacks, in batches, with a bar."""
@@ -161,16 +164,15 @@ class Study(ABC, Generic[RowType]):
 def run_study(study: Study[RowType]) -> None:
     """Measure what is missing, draw, write and print the report, and record it for MLflow."""
     folder, parent = study.folder, parent_of(study.weights)
-    with (
-        EvaluationFolder(folder).alone(),
-        recorded(folder, kind="evaluate", name=study.name, parent=parent, parameters=study.settings),
-    ):
-        rows = _measured(study)
-        study.draw(rows)
-        text = study.report(rows)
-        write_atomically(folder / f"{study.name}.md", text.encode())
-        artifacts = [name for name in study.files if (folder / name).exists()]
-        update_record(folder, artifacts=artifacts, metrics=study.metrics(rows))
+    with EvaluationFolder(folder).alone():
+        study.prepare()
+        with recorded(folder, kind="evaluate", name=study.name, parent=parent, parameters=study.settings):
+            rows = _measured(study)
+            study.draw(rows)
+            text = study.report(rows)
+            write_atomically(folder / f"{study.name}.md", text.encode())
+            artifacts = [name for name in study.files if (folder / name).exists()]
+            update_record(folder, artifacts=artifacts, metrics=study.metrics(rows))
     sync = f"dsffnet sync {shlex.quote(str(folder))}"
     print_text(f"{text}\npictures, rows, this text: {folder} ({', '.join(study.files)}). To MLflow: {sync}")
 

@@ -50,16 +50,18 @@ class GeneralisationStudy(Study[GeneralisationRow]):
         self.weights = weights_of(options)
         base, self.methods = _base(options, self.weights), methods_of(self.weights)
         self.folder = folder_of(options, self.weights, self.name)
-        extra = [imported_kind(require_reachable(url, option="--data", urls=True)) for url in options.data]
-        made = make_kinds(base, options.topologies, options.others, self.folder / "data", sizes, say=say)
-        self.kinds = _named_apart([*made, *extra])
+        self._extra = [imported_kind(require_reachable(url, option="--data", urls=True)) for url in options.data]
+        self._asked = base, options.topologies, options.others, self.folder / "data", sizes
+
+    def prepare(self) -> None:
+        self.kinds = _named_apart([*make_kinds(*self._asked, say=say), *self._extra])
         self.names = [kind.name for kind in self.kinds]
         self.trained = [_trained(each, self.kinds) for each in self.weights]
         self.settings = {
             "weights": about_weights(self.weights),
             "methods": [method.name for method in self.methods],
             "kinds": {kind.name: kind.dataset.uuid for kind in self.kinds},
-            "triples": sizes.triples,
+            "triples": self.sizes.triples,
         }
 
     def measure(self, done: list[GeneralisationRow]) -> Iterable[list[GeneralisationRow]]:

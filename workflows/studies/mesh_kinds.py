@@ -21,6 +21,7 @@ from datagen.recipe import (
     SmplBody,
 )
 from datagen.store import Dataset, open_dataset
+from datagen.store.verify import require_recipe
 from training.evaluation.generalisation import MeshKind
 from training.tracking.provenance import provenance_of
 from workflows.studies.sizes import Other, Sizes
@@ -112,12 +113,17 @@ def _standin(base: DatasetRecipe, folder: Path, sizes: Sizes) -> MeshKind:
 
 def _kind(recipe: DatasetRecipe, url: Path) -> MeshKind:
     place = str(url.absolute())
-    try:
-        dataset = generate(recipe, place)
-    except DatasetError:  # of other sizes, say: a study makes its own data anew
-        dataset = generate(recipe, place, fresh=True)
+    dataset = generate(recipe, place, fresh=_is_of_another(recipe, place))
     name = f"{_family(recipe)} {_counts(dataset)}"
     return MeshKind(name, dataset, f"{recipe.poses.model_dump_json()} {recipe.identities.evaluation}")
+
+
+def _is_of_another(recipe: DatasetRecipe, place: str) -> bool:
+    """Whether a dataset was made by another recipe, of other sizes, say: a study makes its own data anew then."""
+    try:
+        return require_recipe(place) != recipe
+    except DatasetError:
+        return False
 
 
 def imported_kind(url: str) -> MeshKind:

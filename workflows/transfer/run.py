@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.common.errors import MeshError, storage_errors
-from datagen.mesh.files import MeshFile, load_mesh, write_posed
+from datagen.mesh.files import MeshFile, write_posed
 from datagen.mesh.geometry import InFaces, Mesh
 from datagen.mesh.sequences import require_animation, write_animation
 from training.inference.domain_check import Tears, about_loose, remarks, seen_by
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from training.viz.transfer_example import Comparison, NamedMesh
 
 _SHOWN_FRAMES = 4  # of a sequence, in its picture
-_ROUNDED = 1e-4  # of the body's longest extent: by so much a file may round coordinates
 _POINTS_SHOWN = 10_000  # of a source without faces
 _VOTING_FRAMES = 3  # of a sequence, on how it stands
 
@@ -191,8 +190,6 @@ class TransferWork:
         written = write_posed(self.target, posed.vertices, out, beside=beside)
         if written.left_out and beside:
             warn(f"{out.name} does not keep: {'; '.join(written.left_out)}")
-        if beside and (line := _about_rounding(posed, out)):
-            self._warn(line)
         return written.files
 
     def posed(self) -> Iterator[Mesh]:
@@ -201,7 +198,10 @@ class TransferWork:
         for number, posed in enumerate(self._frames(), 1):
             if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
                 is_torn = True
-                line += ", or --model dressed" if self.by == "human" else ""
+                others = [] if self.job.refine else ["--refine"]
+                if self.by == "human" and self._known is None:  # else it was tried
+                    others.append("--model dressed")
+                line += f", and try {' or '.join(others)}" if others else ""
                 self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)
             yield posed
 
@@ -242,7 +242,8 @@ class TransferWork:
         from training.viz.viewer import MOTION_LIMIT, frames_apart
 
         count = self.job.count
-        apart = frames_apart(count, len(self.first.vertices) + len(self.target.mesh.vertices))
+        of_source = len(self.first.vertices) if len(self.first.faces) else len(self._upright_source(0).vertices)
+        apart = frames_apart(count, of_source + len(self.target.mesh.vertices))
         if apart > 1:
             warn(
                 f"{self.job.beside('.html')} plays one of {apart} frames: all {count:,} take more than "
@@ -322,20 +323,6 @@ def _upright(mesh: Mesh, axes: Axes | Standing, path: Path, look: "Look | None")
         mesh, look = drawable(Mesh(mesh.vertices[some], mesh.faces)), None
     fits = look is not None and look.fits(len(mesh.vertices), len(mesh.faces))
     return NamedMesh(axes.turned(mesh.vertices), mesh.faces, path.name, look if fits else None)
-
-
-def _about_rounding(posed: Mesh, out: Path) -> str:
-    """What to say of a mesh so far from the origin that its file's numbers are too short for it; "" of any other."""
-    size, far = float(np.ptp(posed.vertices, axis=0).max()), float(np.abs(posed.vertices).max())
-    if np.spacing(np.float32(far)) <= _ROUNDED * size:
-        return ""
-    off = float(np.abs(load_mesh(out).vertices - posed.vertices).max())
-    if off <= _ROUNDED * size:
-        return ""
-    return (
-        f"{out} is rounded by up to {off:.2g}, {off / size:.1%} of the body, as its coordinates reach {far:,.0f}: move "
-        "the target near the origin"
-    )
 
 
 def _move(path: Path, place: Path, *, is_own: bool) -> None:

@@ -22,6 +22,7 @@ from datagen.mesh.formats.gltf import SOLID, Gltf, triangles
 from datagen.mesh.formats.gltf_materials import base_texture, image_bytes, read_material
 from datagen.mesh.formats.surface import Alone, Encoded, Format, Image, Surface, numbered, srgb, unit
 from datagen.mesh.geometries import require_few, require_known_names, require_one_body
+from datagen.mesh.geometry import NEEDS_FACES
 from datagen.mesh.limits import require_counts
 
 
@@ -36,7 +37,7 @@ def read_glb(path: Path, geometries: Sequence[str]) -> "GlbContent":
     scene = _opened(path)
     nodes = solid_nodes(scene)
     if not nodes:
-        raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); pose transfer needs a mesh")
+        raise MeshError(f"{path} has no faces (a point cloud, lines, or an empty scene?); {NEEDS_FACES}")
     require_known_names(geometries, nodes, path, what="geometry")
     shown = {name: node for name, node in nodes.items() if node in scene.shown and not _is_nothing(scene, node)}
     taken = {name: node for name, node in nodes.items() if name in geometries} or shown or nodes

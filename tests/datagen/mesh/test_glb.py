@@ -205,8 +205,9 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
     for ground in ((9, 0, 9), (4, 0.02, 4), (2.5, 0.05, 2.5)):
         with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
             read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box(ground)))
-    staff = read_mesh_file(two(tmp_path, (0, 0, 0.5), trimesh.creation.box((0.03, 3, 0.03))))
-    assert staff.geometries == ("body", "other")
+    for worn in ((0.03, 3, 0.03), (3, 2.5, 0.08)):
+        staff_or_wings = read_mesh_file(two(tmp_path, (0, 0, 0.5), trimesh.creation.box(worn)))
+        assert staff_or_wings.geometries == ("body", "other")
 
 
 def test_too_many_geometries_are_refused_before_any_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

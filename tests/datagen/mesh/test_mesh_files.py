@@ -13,10 +13,11 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from datagen.common.errors import MeshError, StorageError
 from datagen.mesh import limits as mesh_limits
-from datagen.mesh.files import MeshFile, check_writable, read_mesh_file, save_mesh, write_posed
+from datagen.mesh.files import MeshFile, check_writable, load_mesh, read_mesh_file, save_mesh, write_posed
 from datagen.mesh.formats import FORMATS
 from datagen.mesh.geometry import Mesh
 from tests.support.shapes.mesh_files import PNG, golden
@@ -246,3 +247,19 @@ def test_a_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(Path, "open", denied)
     with pytest.raises(MeshError, match=r"body\.obj cannot be read: Permission denied"):
         read_mesh_file(path)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "at", "is_told"),
+    [(".glb", 0.0, False), (".glb", 2e3, False), (".glb", 5e4, True), (".stl", 5e4, True), (".obj", 5e4, False),
+     (".obj", 5e6, True), (".off", 5e6, True), (".ply", 5e6, True)],
+)  # fmt: skip
+def test_positions_that_a_file_rounds_are_told_of(tmp_path: Path, suffix: str, at: float, is_told: bool) -> None:
+    ball = trimesh.creation.icosphere(2)
+    save_mesh(Mesh(np.asarray(ball.vertices) + np.array([at, 0, 0]), np.asarray(ball.faces)), tmp_path / "far.obj")
+    read = read_mesh_file(tmp_path / "far.obj")
+    left_out = write_posed(read, read.mesh.vertices, tmp_path / f"out{suffix}").left_out
+    assert any("positions to better than" in line for line in left_out) == is_told
+    if not is_told:
+        again = load_mesh(tmp_path / f"out{suffix}").vertices
+        assert cKDTree(again).query(read.mesh.vertices)[0].max() < 2e-4

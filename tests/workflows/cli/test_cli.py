@@ -177,7 +177,7 @@ def test_fresh_training_removes_nothing_but_a_training(tmp_path: Path, trained: 
     (tmp_path / "other" / "thesis.txt").write_text("precious")
     for place, says in (
         ("workflow", "is the folder of another kind of work: workflow 'w'"),
-        ("other", "holds files, but no training of ours (thesis.txt), which might be replaced. Choose a folder"),
+        ("other", "is not the folder of a training, so --fresh leaves it alone"),
     ):
         result = command("train", "--recipe", "smoke", "--data", trained[0], "--out", tmp_path / place, "--fresh")
         fails(result, 2, says)
@@ -231,7 +231,7 @@ REFUSED: list[tuple[int, str, str, dict[str, str]]] = [
     (2, "--set data.poses.seen changes nothing here", "train --data leg.zarr --out new --set data.poses.seen=3", {}),
     (2, "--set training.steps changes nothing here", "evaluate new --data leg.zarr --set training.steps=3", {}),
     (2, "--set beside.steps changes nothing", "generate --recipe smoke --out new --local --set beside.steps=3", {}),
-    (2, "holds files, but no training of ours (empty.yaml)", "train --recipe smoke --data leg.zarr --out mine", {}),
+    (2, "holds recipe.yaml, which one would replace", "train --recipe smoke --data leg.zarr --out mine", {}),
     (1, "Copy the weights of that name, which come along", "evaluate human --data leg.zarr", {}),
     (2, "which smal is not made from", "stand-in smal --topology soma --out new.npz", {}),
     (2, "'--out' is followed by an empty text", "generate --recipe smoke --local --out=", {}),
@@ -252,7 +252,7 @@ def test_what_cannot_be_done_is_one_line_and_changes_nothing(
     (here / "empty.yaml").write_text("")
     (here / "whole" / "dataset.zarr").mkdir(parents=True, exist_ok=True)
     (here / "mine").mkdir(exist_ok=True)
-    (here / "mine" / "empty.yaml").write_text("")
+    (here / "mine" / "recipe.yaml").write_text("mine")
     before = tree_hash(here)
     name, *rest = words.format(here=here, nothing="{nothing}").split()
     given = rest if name == "full" else [name, *rest]

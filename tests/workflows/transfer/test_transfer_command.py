@@ -447,12 +447,14 @@ def test_a_source_may_be_points_and_a_target_needs_faces(transfer: Transfer, tmp
     points = written_obj(tmp_path / "scan.obj", ROUND, TRIANGLES[:0])
     cloud = tmp_path / "scan.ply"
     trimesh.PointCloud(ROUND).export(cloud)
+    transfer(written_obj(tmp_path / "ball.obj", ROUND, TRIANGLES), "person.obj", "-o", tmp_path / "posed.obj")
+    expected = load_mesh(tmp_path / "posed.obj").vertices  # this network sees vertices alone
     for number, scan in enumerate((points, cloud)):
         transfer(scan, "person.obj", "-o", tmp_path / f"{number}.obj", "--picture", "--viewer")
-        assert len(load_mesh(tmp_path / f"{number}.obj").vertices) == len(load_mesh("person.obj").vertices)
+        np.testing.assert_allclose(load_mesh(tmp_path / f"{number}.obj").vertices, expected, atol=1e-5)
         assert (tmp_path / f"{number}.png").stat().st_size and (tmp_path / f"{number}.html").stat().st_size
         with pytest.raises(
-            MeshError, match=r"42 vertices and no faces .*; a target needs triangles .*source may be po"
+            MeshError, match=r"42 vertices and no faces .*; triangles are needed; only the source .* may be po"
         ):
             transfer("pose.obj", scan, "-o", tmp_path / "x.obj")
 
