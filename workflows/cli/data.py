@@ -375,7 +375,7 @@ def _show(made: "Dataset") -> None:
 
 
 COMMANDS = (
-    Command(generate_command, declare_generate, takes_recipe=True),
+    Command(generate_command, declare_generate, takes_recipe=True, section="data"),
     Command(inspect_command, declare_inspect),
     Command(append_command, declare_append),
     Command(verify_command, declare_verify),

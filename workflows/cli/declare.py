@@ -16,11 +16,14 @@ _WORDS = ("result", "latest", "best")
 
 @dataclass(frozen=True)
 class Command:
-    """A subcommand: ``NAME_command``, whose docstring is its help; with ``takes_recipe`` that lists keys, too."""
+    """A subcommand: ``NAME_command``, whose docstring is its help; with ``takes_recipe`` that lists keys, too: all that
+    it takes, or those of one ``section``.
+    """
 
     run: Callable[[argparse.Namespace], None]
     add_options: Callable[[Parser], None]
     takes_recipe: bool = False
+    section: str = ""
 
     @property
     def name(self) -> str:
@@ -38,7 +41,7 @@ class Command:
         made = commands.add_parser(
             self.name,
             description=text,
-            epilog=recipe_keys(words) if words is not None and self.takes_recipe else None,
+            epilog=recipe_keys(words, self.section) if words is not None and self.takes_recipe else None,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         made.set_defaults(command=self.run)
@@ -53,20 +56,21 @@ def add_help_all(made: Parser) -> None:
     made.add_argument("--help-all", action="help", help="this help, with the keys of all bodies, poses and networks")
 
 
-def recipe_keys(words: Sequence[str]) -> str | None:
+def recipe_keys(words: Sequence[str], section: str = "") -> str | None:
     """Keys of a recipe for the end of a help text, if ``words`` ask for help: of the one that they choose, or all."""
     if not any(word == "-h" or word.startswith("--h") for word in words):
         return None
     from workflows.recipe.loader import describe_fields, load_recipe
 
     if "--help-all" in words:
-        return "\n".join(["keys for --set, with their defaults:", *describe_fields()])
+        head, keys = "keys for --set, with their defaults:", describe_fields()
+        return "\n".join([head, *(key for key in keys if key.startswith(f"  {section}"))])
     asking = Parser(add_help=False, allow_abbrev=False)
     add_recipe_options(asking)
     chosen = asking.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
     recipe = load_recipe(chosen.recipe, chosen.set)
     head = f"keys for --set, with the values of --recipe {chosen.recipe} (other bodies and networks: --help-all):"
-    return "\n".join([head, *describe_fields(recipe=recipe)])
+    return "\n".join([head, *(key for key in describe_fields(recipe=recipe) if key.startswith(f"  {section}"))])
 
 
 def which_checkpoint(word: str) -> str | int:

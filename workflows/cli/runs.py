@@ -189,8 +189,8 @@ def _mirrored(run: Path, options: argparse.Namespace) -> Iterator[None]:
 
 
 COMMANDS = (
-    Command(train_command, _train_options, takes_recipe=True),
-    Command(evaluate_command, _evaluate_options, takes_recipe=True),
+    Command(train_command, _train_options, takes_recipe=True, section="training"),
+    Command(evaluate_command, _evaluate_options, takes_recipe=True, section="evaluation"),
     Command(recipe_command, add_recipe_options, takes_recipe=True),
     Command(import_weights_command, _import_weights_options),
     Command(sync_command, _sync_options),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic_core import PydanticUndefined, to_json
 
 from datagen.common.errors import RecipeError
 from datagen.common.printable import nearest
@@ -181,11 +182,8 @@ def describe_fields(
         if not sections:
             default: Any = value if recipe else field.get_default(call_default_factory=True)
             default = f"a training of {default.network.name!r}" if isinstance(default, TrainingRecipe) else default
-            shown = (
-                [part.model_dump() for part in default]
-                if is_list and default and isinstance(default[0], BaseModel)
-                else default
-            )
+            is_text = isinstance(default, str) or default is PydanticUndefined
+            shown = default if is_text else to_json(default).decode()  # as --set takes it
             words = textwrap.wrap(field.description or "", 100)
             yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
 

@@ -57,7 +57,7 @@ def test_the_overview_begins_with_what_somebody_new_does_first() -> None:
 
 
 def help_of(*words: str) -> str:
-    return command("train", *words).stdout.partition("keys for --set")[2]
+    return command("recipe", *words).stdout.partition("keys for --set")[2]
 
 
 def test_help_shows_the_keys_of_what_is_chosen_and_all_of_them_on_request() -> None:
@@ -71,6 +71,9 @@ def test_help_shows_the_keys_of_what_is_chosen_and_all_of_them_on_request() -> N
         assert all(key in text for key in there) and not any(key in text for key in missing)
     changed = help_of("--help", "--set", "training.network.name=npt", "training.steps=7")
     assert "training.network.variant" in changed and "training.steps = 7" in changed
+    for name, section in (("generate", "data"), ("train", "training"), ("evaluate", "evaluation")):
+        keys = command(name, "--help").stdout.partition("keys for --set")[2].splitlines()[1:]
+        assert keys and all(key.startswith((f"  {section}", "      ")) for key in keys), "those that it takes"
 
 
 def test_parsers_import_nothing_heavy() -> None:
