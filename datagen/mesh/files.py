@@ -137,7 +137,9 @@ def _reading(path: Path) -> Iterator[None]:
         raise MeshError(f"{path} cannot be read: {error.strerror or error}") from error
     except DAMAGE as error:
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
-        raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
+        raise MeshError(
+            f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}. Copy or export it again"
+        ) from error
 
 
 def _one_line(reason: object) -> str:
