@@ -103,6 +103,8 @@ _OF_PYTHON = {
     f"Choose with {CHOOSE}": "Give the one that is the body by itself",
     "choose it by --source-geometry or --target-geometry, or save it by itself": "give it by itself",
     "look at --picture": "look at it",
+    "try --refine": "try refine=True",
+    "--model dressed": "model='dressed'",
     "choose another --out": "choose another path",
     "add --tracking-uri URI, or set": "set",
     "check --tracking-uri": "check MLFLOW_TRACKING_URI",
@@ -183,7 +185,7 @@ def _both(given: Any) -> Any:
         return given, None
     if not hasattr(given, "vertices"):
         return given
-    return given.vertices, getattr(given, "faces", getattr(given, "triangles", None))
+    return given.vertices, given.faces if hasattr(given, "faces") else getattr(given, "triangles", None)
 
 
 def _whole(scene: Any, role: str) -> Mesh:

@@ -137,9 +137,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise MeshError(f"{path} cannot be read: {error.strerror or error}") from error
     except DAMAGE as error:
         reason = error if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
-        raise MeshError(
-            f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}. Copy or export it again"
-        ) from error
+        raise MeshError(f"{path} cannot be read as {path.suffix[1:].upper()}: {_one_line(reason)}") from error
 
 
 def _one_line(reason: object) -> str:
@@ -202,13 +200,19 @@ def write_posed(original: MeshFile, vertices: NDArray[np.floating], out: Path, *
         else:
             left_out.append(f"{name}: another file of that name is in {out.parent} and was left as it is")
     write_atomically(out, made.content)
-    return Written([*files, out], list(dict.fromkeys([*left_out, *lost_digits(np.asarray(vertices), out)])))
+    return Written([*files, out], list(dict.fromkeys([*left_out, *lost_digits(original, np.asarray(vertices), out)])))
 
 
-def lost_digits(vertices: NDArray[np.floating], out: Path) -> list[str]:
-    """What to say where numbers of a file are too short for vertices [n, 3] that far from the origin; else nothing."""
+def lost_digits(original: MeshFile, vertices: NDArray[np.floating], out: Path) -> list[str]:
+    """What to say where numbers of a file are too short for vertices [n, 3] that far from the origin; else nothing.
+
+    Nor is anything said of a GLB, PLY or STL that stays one, as its numbers and nodes are those that the file had.
+    """
+    suffix = out.suffix.lower()
+    if suffix == original.path.suffix.lower() and suffix not in (".obj", ".off"):
+        return []
     far, size = float(np.abs(vertices).max()), float(np.ptp(vertices, axis=0).max())
-    if out.suffix.lower() in (".obj", ".off"):
+    if suffix in (".obj", ".off"):
         off = 0.5 * 10.0 ** (np.floor(np.log10(max(far, 1e-300))) - _DIGITS)
     else:
         off = float(np.spacing(np.float32(far))) / 2

@@ -12,6 +12,7 @@ from datagen.common.printable import nearest
 CHOOSE = "--source-geometry NAME or --target-geometry NAME (again for more)"
 _REACH = 0.1  # of the longest edge of any box: geometries that are nearer than this belong together
 _FLAT, _PLATE = 1e-3, 0.03  # of its own longest edge: what is flatter is ground or background, or a plate, which may be
+_ROD = 0.05  # of its own longest edge: what is no wider is neither
 _MOST = 1_000
 _NAMED = 12  # in a message
 
@@ -75,8 +76,10 @@ def _together(boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
 def _is_ground(boxes: NDArray[np.float64], place: int) -> bool:
     size, others = np.ptp(boxes[place], axis=0), np.delete(boxes, place, axis=0)
     low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
-    if size.max() <= (high - low).max():
+    thin, (thick, wide, long) = int(size.argmin()), np.sort(size)
+    if long <= (high - low).max() or wide <= _ROD * long:
         return False
-    thin, middle = int(size.argmin()), boxes[place].mean(axis=0)
-    stands_on_it = high[thin] - low[thin] >= 0.5 * (high - low).max() and not low[thin] < middle[thin] < high[thin]
-    return bool(size.min() <= (_PLATE if stands_on_it else _FLAT) * size.max())
+    under, over = boxes[place][:, thin]
+    is_at_its_end = low[thin] >= under or high[thin] <= over
+    stands_on_it = is_at_its_end and high[thin] - low[thin] >= 0.5 * (high - low).max()
+    return bool(thick <= (_PLATE if stands_on_it else _FLAT) * long)

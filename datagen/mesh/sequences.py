@@ -111,4 +111,4 @@ def write_animation(
     sound = (usable(original, frame) for frame in frames)
     draft, left_out = draft_of(original)
     draft.animated(sound, out, frames_per_second=frames_per_second)
-    return [*left_out, *lost_digits(original.mesh.vertices, out)]
+    return [*left_out, *lost_digits(original, original.mesh.vertices, out)]

@@ -119,6 +119,8 @@ def test_messages_speak_of_arguments(run: Path, monkeypatch: pytest.MonkeyPatch,
     advice = "add --align, or --up=Z,Y --front=-Y,Z: or add --force; look at --picture"
     assert _of_python(advice) == "add align=True, or up='Z,Y', front='-Y,Z': or add force=True; look at it"
     assert _of_python("State --up=Z") == "State up='Z'"
+    advice = "look at --picture, and try --refine or --model dressed"
+    assert _of_python(advice) == "look at it, and try refine=True or model='dressed'"
 
 
 def test_a_source_may_be_points(run: Path) -> None:

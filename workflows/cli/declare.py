@@ -69,7 +69,8 @@ def recipe_keys(words: Sequence[str], section: str = "") -> str | None:
     add_recipe_options(asking)
     chosen = asking.parse_known_args([word for word in words if word not in ("-h", "--help")])[0]
     recipe = load_recipe(chosen.recipe, chosen.set)
-    head = f"keys for --set, with the values of --recipe {chosen.recipe} (other bodies and networks: --help-all):"
+    others = " (other bodies and networks: --help-all)" if section != "evaluation" else ""
+    head = f"keys for --set, with the values of --recipe {chosen.recipe}{others}:"
     return "\n".join([head, *(key for key in describe_fields(recipe=recipe) if key.startswith(f"  {section}"))])
 
 

@@ -185,7 +185,7 @@ class RunFolder(_Folder):
     def require_kind(self) -> None:
         """Refuse, beside what :meth:`_Folder.require_kind` does, files of others that a training would replace."""
         super().require_kind()
-        if not self._is_training():
+        if not self._is_training() and not (self.journal.is_file() and self.provenance.is_file()):
             replaced = [path.name for path in self.owned() if not _matches(path, self.kept)]
             if replaced and not (self.path / self.record.name).exists():
                 raise RecipeError(
@@ -196,7 +196,7 @@ class RunFolder(_Folder):
     def _is_training(self) -> bool:
         """By its record, or, where torchrun trained without a workflow, by what every training writes."""
         record = read_record(self.path)
-        return record.kind == "train" if record else self.journal.is_file()
+        return record.kind == "train" if record else self.checkpoints.is_dir() and self.journal.is_file()
 
 
 class WorkflowFolder(_Folder):

@@ -183,7 +183,7 @@ def describe_fields(
             default: Any = value if recipe else field.get_default(call_default_factory=True)
             default = f"a training of {default.network.name!r}" if isinstance(default, TrainingRecipe) else default
             is_text = isinstance(default, str) or default is PydanticUndefined
-            shown = default if is_text else to_json(default).decode()  # as --set takes it
+            shown = default if is_text else to_json(default).decode()
             words = textwrap.wrap(field.description or "", 100)
             yield "\n".join([f"  {prefix}{name} = {shown}", *(f"      {line}" for line in words)])
 
@@ -267,12 +267,14 @@ def _describe(fault: Any, listed: set[str] | None, model: type[BaseModel]) -> st
 
 
 def _nearest_key(key: str, names: Sequence[str], known: Sequence[str]) -> str:
-    """Words that suggest a key of the section, which has ``names``; one of that name elsewhere; or any that is near."""
+    """Words that suggest a key of that name elsewhere; one of the section, which has ``names``; or any that is near."""
     section, _, last = key.rpartition(".")
+    every = [".".join(name.split(".")[:upto]) for name in known for upto in range(1, name.count(".") + 2)]
+    if there := nearest(key, [name for name in every if name.split(".")[-1] == last]):
+        return there
     if close := difflib.get_close_matches(last, names, n=1, cutoff=0.6):
         return f", did you mean {'.'.join(filter(None, (section, close[0])))!r}?"
-    every = [".".join(name.split(".")[:upto]) for name in known for upto in range(1, name.count(".") + 2)]
-    return nearest(key, [name for name in every if name.split(".")[-1] == last]) or nearest(key, known)
+    return nearest(key, known)
 
 
 def _is_one_of_several(section: str, place: str) -> bool:

@@ -121,7 +121,7 @@ def _kind(recipe: DatasetRecipe, url: Path) -> MeshKind:
 def _is_of_another(recipe: DatasetRecipe, place: str) -> bool:
     """Whether a dataset was made by another recipe, of other sizes, say: a study makes its own data anew then."""
     try:
-        return require_recipe(place) != recipe
+        return require_recipe(place).sha256() != recipe.sha256()
     except DatasetError:
         return False
 

@@ -23,7 +23,7 @@ class Chosen:
     """Weights, their network, and how source and target stand, as the network finds or a person says.
 
     ``doubts``: of each of the two, why it may be no body at all, or nothing. ``posed``: the target in the source's
-    pose, where that was tried.
+    pose, where that was tried. ``is_unrivalled``: whether no others were asked.
     """
 
     weights: Path
@@ -31,6 +31,7 @@ class Chosen:
     standings: Pair
     doubts: tuple[str, str] = ("", "")
     posed: Mesh | None = None
+    is_unrivalled: bool = False
 
     @classmethod
     def of(cls, weights: Path, job: TransferJob, meshes: tuple[Mesh, Mesh], load: Load) -> "Chosen":
@@ -102,7 +103,7 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     if people.is_sure:
         people = people.tried(meshes)
         if not (torn := people.torn(meshes[1])):
-            return people
+            return replace(people, is_unrivalled=True)
         dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
         dressed = dressed.tried(meshes) if dressed.is_read else dressed
         return dressed if dressed.is_read and dressed.torn(meshes[1]) <= torn / 2 else people

@@ -58,6 +58,7 @@ class TransferWork:
         self._seen = InFaces(target.mesh)
         self.axes: tuple[Axes | Standing, Axes | Standing] = job.axes or (UPRIGHT, UPRIGHT)
         self.by, self._known, self._warn = by, known, warn
+        self._is_unrivalled = False  # by human, dressed not being asked
         self._shown: dict[int, Mesh] = {}
         self._played: dict[int, Mesh] = {}
         self._beside: list[Path] = []
@@ -94,6 +95,7 @@ class TransferWork:
             if known is not None and len(seen[1].loose):
                 known = Mesh(seen[1].of_all(known.vertices), target.mesh.faces)
             work = cls(job, found.transfer, first=first, target=target, by=by, known=known, warn=warn)
+            work._is_unrivalled = found.is_unrivalled
             work._take(found.standings, found.weights, found.doubts)
             return work
         transfer = (load or PoseTransfer.from_run)(weights, project=job.project)
@@ -199,7 +201,7 @@ class TransferWork:
             if not is_torn and (line := tears.in_output(posed, name=str(self.job.target))):
                 is_torn = True
                 others = [] if self.job.refine else ["--refine"]
-                if self.by == "human" and self._known is None:  # else it was tried
+                if self._is_unrivalled:
                     others.append("--model dressed")
                 line += f", and try {' or '.join(others)}" if others else ""
                 self._warn(f"frame {number}: {line}" if self.job.is_sequence else line)

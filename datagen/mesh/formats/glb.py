@@ -101,7 +101,7 @@ class GlbContent(Alone):
         self._file, self._nodes = file, {node: place for place, node in enumerate(nodes.values())}
         for name, node in nodes.items():
             if _is_nothing(file, node):
-                raise ValueError(f"node {name!r} is scaled to nothing: apply its scale")
+                raise ValueError(f"node {name!r} is scaled to nothing: apply its scale and export it again")
         self._pieces = list(self._read_pieces())
         firsts: dict[tuple[int, int], Piece] = {}
         for piece in self._pieces:

@@ -205,7 +205,9 @@ def test_geometries_apart_or_on_a_ground_are_refused_until_some_are_chosen(tmp_p
     for ground in ((9, 0, 9), (4, 0.02, 4), (2.5, 0.05, 2.5)):
         with pytest.raises(MeshError, match="flat and larger than the others: 'other'"):
             read_mesh_file(two(tmp_path, (0, -1, 0), trimesh.creation.box(ground)))
-    for worn in ((0.03, 3, 0.03), (3, 2.5, 0.08)):
+    with pytest.raises(MeshError, match="flat and larger"):
+        read_mesh_file(two(tmp_path, (0, -0.98, 0), trimesh.creation.box((4, 0.05, 4))))
+    for worn in ((0.03, 3, 0.03), (0.002, 3, 0.002), (3, 2.5, 0.08)):
         staff_or_wings = read_mesh_file(two(tmp_path, (0, 0, 0.5), trimesh.creation.box(worn)))
         assert staff_or_wings.geometries == ("body", "other")
 
