@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from ray.dashboard.modules.job.common import JobStatus
+from ray.exceptions import AuthenticationError
 
 from datagen.common.errors import ClusterError
 from workflows.cli import submit as submit_command
@@ -132,6 +133,20 @@ def test_ctrl_c_leaves_the_job_and_says_how_to_look_at_it(
     said = capsys.readouterr().err
     assert said.startswith("interrupted; the job continues") and "ray job logs --follow raysubmit_x" in said
     assert "run the same command again" not in said
+
+
+def test_a_cluster_that_asks_for_a_token_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(address: str | None) -> None:
+        raise AuthenticationError("Token authentication is enabled but no token was found")
+
+    monkeypatch.setattr("ray.job_submission.JobSubmissionClient", refuse)
+    with pytest.raises(SystemExit) as ended:
+        main(["submit", "--address", "http://head:8265", "--", "true"])
+    said = capsys.readouterr().err
+    assert ended.value.code == 1 and said.count("\n") == 1
+    assert said.startswith("error: the job could not be submitted to http://head:8265: Token authentication is enabled")
 
 
 def test_a_cluster_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -165,9 +165,13 @@ def test_data_of_other_sizes_are_made_anew(tmp_path: Path) -> None:
         assert kind.dataset.recipe.poses.seen == poses
 
 
-def test_a_study_waits_for_nobody_in_its_folder(dataset: str, run: Path, tmp_path: Path) -> None:
-    with EvaluationFolder(tmp_path / "study").alone(), pytest.raises(WorkflowError, match="another command is at work"):
-        study("robustness", str(run), "--data", dataset, "--out", str(tmp_path / "study"), "--triples", "1")
+def test_a_study_waits_for_nobody_in_its_folder_and_makes_nothing_there(
+    dataset: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workflows.studies.generalisation.make_kinds", lambda *_, **__: pytest.fail("data were made"))
+    for name, data in (("robustness", ["--data", dataset]), ("generalisation", [])):
+        with EvaluationFolder(tmp_path / name).alone(), pytest.raises(WorkflowError, match="another command is at wor"):
+            study(name, str(run), *data, "--out", str(tmp_path / name), "--triples", "2")
 
 
 def test_people_are_the_same_in_every_topology_and_new() -> None:
