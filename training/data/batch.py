@@ -44,6 +44,9 @@ class Batch:
         What is near along the surfaces of the sources, and of the targets, for a network that asks; None: not known.
     points
         Of which points of their surfaces the sources and the targets are made, in the place of vertices; None: of none.
+    turns
+        World rotations [b, joint, 3, 3] of the pose joints of the sources, and of the targets, where some are in other
+        poses than their triples name; None: none are.
     """
 
     source: Tensor
@@ -57,6 +60,7 @@ class Batch:
     posed: tuple[Posed, Posed] | None = None
     surfaces: tuple[Surface, Surface] | None = None
     points: tuple[SurfacePoints, SurfacePoints] | None = None
+    turns: tuple[Tensor, Tensor] | None = None
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> "Batch":
         """The same on another device."""
@@ -69,8 +73,9 @@ class Batch:
         posed = self.posed and (self.posed[0].to(device), self.posed[1].to(device))
         surfaces = self.surfaces and (self.surfaces[0].to(device), self.surfaces[1].to(device))
         points = self.points and (self.points[0].to(device), self.points[1].to(device))
+        turns = self.turns and (self.turns[0].to(device), self.turns[1].to(device))
         counts = self.source_counts, self.target_counts
-        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed, surfaces, points)
+        return Batch(source, target, truth, edges, *counts, of_source, of_target, posed, surfaces, points, turns)
 
     def __len__(self) -> int:
         return len(self.source)

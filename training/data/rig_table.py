@@ -13,9 +13,10 @@ from torch import Tensor
 
 from datagen.common.errors import RecipeError
 from datagen.mesh.geometry import edges_of
-from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
+from datagen.mesh.rig import Rig, skinned, world_rotations
 from datagen.store import Dataset
 from training.data.batch import Batch
+from training.data.posed_bodies import body_at_rest, rig_of
 from training.data.row_random import Purpose, RowRandom
 from training.data.surface_points import SurfacePoints, Triangles, points_of
 from training.data.triples import Triples
@@ -28,7 +29,6 @@ from training.objectives.parts import Posed
 
 _OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 _OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
-_POSES = 8  # of an identity, that its body at rest is found from
 
 
 class RigTable:
@@ -67,9 +67,8 @@ class RigTable:
                 f"{', '.join(self._poses)}. Name those that the bodies have: --set training.network.joints=..."
             )
         world = world_rotations(dataset.rotations(), dataset.attributes["joint_parents"])
-        chosen = [self._poses.index(name) for name in self._names]
-        self._turns = world
-        self._world = torch.from_numpy(world[:, chosen].astype(np.float32)).to(device)
+        self._turns, self._world = world, torch.from_numpy(world.astype(np.float32)).to(device)
+        self._chosen = torch.tensor([self._poses.index(name) for name in self._names], device=device)
         self._device, self._row = torch.device(device), dict[int, int]()
         weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
         surfaces, triangles = list[Surface](), list[Triangles]()
@@ -99,8 +98,10 @@ class RigTable:
     def posed(self, triples: Triples, batch: Batch) -> Batch:
         """The batch of rows (source identity, source pose, target identity, target pose), with what the rigs say."""
         of_source, of_target = batch.points or (None, None)
-        sources = self._of(triples[:, 0], triples[:, 1], batch.source, batch.source_rows, of_source)
-        targets = self._of(triples[:, 2], triples[:, 3], batch.target, batch.target_rows, of_target)
+        poses = sent(torch.from_numpy(triples[:, [1, 3]].astype(np.int64)), self._device)
+        of_sources, of_targets = batch.turns or self._world[poses].unbind(1)
+        sources = self._of(triples[:, 0], of_sources, batch.source, batch.source_rows, of_source)
+        targets = self._of(triples[:, 2], of_targets, batch.target, batch.target_rows, of_target)
         surfaces = (
             self._surface(triples[:, 0], batch.source, batch.source_rows, of_source),
             self._surface(triples[:, 2], batch.target, batch.target_rows, of_target),
@@ -178,15 +179,17 @@ class RigTable:
     def _of(
         self,
         identities: NDArray[np.integer],
-        poses: NDArray[np.integer],
+        world: Tensor,
         vertices: Tensor,
         rows: Tensor | None,
         points: SurfacePoints | None,
     ) -> Posed:
-        """How meshes of these identities and poses are posed.
+        """How meshes of these identities are posed.
 
         Parameters
         ----------
+        world
+            World rotations [b, joint, 3, 3] of the pose joints.
         vertices
             [b, n, 3] in each mesh' box: those that the step takes.
         rows
@@ -195,14 +198,14 @@ class RigTable:
             Of the meshes, where they are made of some in the place of vertices.
         """
         own = self._rows(identities)
-        about = np.stack([own, self._of_weights[own], self._of_rest[own], self._counts[own] - 1, poses])
-        numbers, of_weights, of_rest, last, pose = sent(torch.from_numpy(about), self._device).unbind(0)
+        about = np.stack([own, self._of_weights[own], self._of_rest[own], self._counts[own] - 1])
+        numbers, of_weights, of_rest, last = sent(torch.from_numpy(about), self._device).unbind(0)
         if rows is None:
             rows = torch.arange(vertices.shape[1], device=self._device).minimum(last[:, None])
         if points is not None:
             points = points.at(rows) if any(points.drawn) else None
         used = rows if points is None else points.corners.flatten(1)
-        turns = self._world.index_select(0, pose)
+        turns = world.index_select(1, self._chosen)
         joints, present = self._joints.index_select(0, numbers), self._present.index_select(0, numbers)
         moved = moved_joints(joints, turns, self._parents, self._above)
         weights, rest = (
@@ -216,17 +219,9 @@ class RigTable:
 
     def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Weights [vertex, part] and, in the poses' rest pose and box units, vertices and joints of an identity."""
-        rig = self._dataset.rig(identity)
-        if rig is None:
-            raise RecipeError(
-                f"training.network 'parts' learns from rigs, but identity {identity} of {self._dataset.url} has none. "
-                "Make a dataset of a body with a skeleton (anny, smpl, smal, rigged), or train another network"
-            )
-        poses = self._dataset.grid.poses_of(identity)[:_POSES]
-        world = self._turns
-        posed = self._dataset.vertices(identity, poses).astype(np.float64)
-        rest = rest_vertices(posed, rig.weights, rig.transforms(world[poses]))
-        still = rig.transforms(np.broadcast_to(np.eye(3), (1, *world.shape[1:])))
+        rig = rig_of(self._dataset, identity)
+        rest = body_at_rest(self._dataset, identity, rig, self._turns)
+        still = rig.transforms(np.broadcast_to(np.eye(3), (1, *self._turns.shape[1:])))
         vertices = skinned(rest, rig.weights, still)[0]
         joints = (still[0, :, :, :3] @ rig.joints[..., None])[..., 0] + still[0, :, :, 3]
         owner = self._owners(rig)

@@ -33,6 +33,8 @@ class Purpose(IntEnum):
     RESIZED = 16
     DEVIATION = 17
     NOISE = 18
+    RECOMBINED = 19
+    JOINT_POSES = 20
 
 
 class RowRandom:

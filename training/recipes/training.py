@@ -147,6 +147,13 @@ class AugmentationRecipe(Frozen):
         description="network parts: share of the sources, and of the targets, that are made of random points of their "
         "surfaces, even by area of the body at rest, in the place of vertices",
     )
+    recombined: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of the triples whose bodies are posed anew by the dataset's rigs, each joint turned as in a "
+        "pose of its own (joints that turn alike in all poses as in one)",
+    )
     shuffle: bool = Field(
         False,
         description="the network sees the target's vertices in another order at each step (3D-CoreNet's authors do, "

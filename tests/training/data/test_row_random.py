@@ -12,6 +12,7 @@ from datagen.store import open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation.augment import Augmentation, _drawn
 from training.data.batch import Batch
+from training.data.posed_bodies import PosedBodies
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom, _hashed
 from training.data.triples import TripleOrder
@@ -227,6 +228,26 @@ def test_cuda_augments_as_the_cpu_does(
     here, there = (augmented(dataset, step=step, device=device) for device in ("cpu", "cuda"))
     assert there.source.device.type == "cuda"
     alike(here, there.to("cpu"))
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_cuda_recombines_poses_as_the_cpu_does(dataset: str) -> None:
+    legs = open_dataset(dataset)
+    identities = legs.identities("training")
+    recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 24, "turn": 25, "points": 0.5, "recombined": 0.5}})
+    (triples,) = next(TripleOrder(identities, legs.grid.poses("seen"), batch=16, seed=1).batches(first_step=0))
+    batch = open_bank(legs, identities).batch(triples)
+    batches = []
+    for device in ("cpu", "cuda"):
+        rigs, bodies = (
+            RigTable(legs, identities, LEG, device=device),
+            PosedBodies(legs, identities, device=device),
+        )
+        batches.append(Augmentation(recipe, rigs, bodies)(triples, batch.to(device), step=2, first=0).to("cpu"))
+    alike(*batches)
+    for one, other in zip(*(its.turns or () for its in batches), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("areas", [False, True])

@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 
 from training.data.augmentation.proportions import of_other_proportions
 from training.data.batch import Batch, Counts, counts_of
+from training.data.posed_bodies import PosedBodies
 from training.data.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom
 from training.data.triples import Triples
@@ -35,15 +36,17 @@ class Augmentation:
         Of the training.
     rigs
         What a network that learns from rigs is told; None: nothing but vertices.
+    bodies
+        By which poses are recombined; None: none are.
     """
 
-    def __init__(self, recipe: TrainingRecipe, rigs: RigTable | None = None) -> None:
-        self._recipe, self._seed, self._rigs = recipe.augmentation, recipe.seed, rigs
+    def __init__(self, recipe: TrainingRecipe, rigs: RigTable | None = None, bodies: PosedBodies | None = None) -> None:
+        self._recipe, self._seed, self._rigs, self._bodies = recipe.augmentation, recipe.seed, rigs, bodies
         self._network = recipe.network
         self._draws_edges = not isinstance(recipe.network, PartsRecipe)  # it has no edge loss
 
     def __call__(self, triples: Triples, batch: Batch, *, step: int, first: int) -> Batch:
-        """The batch changed: as points, turned, cut, thinned; told of its rigs; then of other proportions, and noisy.
+        """The batch changed: posed anew, as points, turned, cut, thinned; told of its rigs; then resized, and noisy.
 
         Parameters
         ----------
@@ -58,10 +61,7 @@ class Augmentation:
         if recipe == AugmentationRecipe(shuffle=recipe.shuffle):
             return self._told(triples, batch)
         random = RowRandom.of_batch(self._seed, step, first=first, rows=len(batch), device=batch.source.device)
-        if recipe.points and self._rigs:
-            batch = self._rigs.of_points(triples, batch, recipe.points, random)
-        if recipe.turn or recipe.lean:
-            batch = _turned(batch, np.radians(recipe.turn), np.radians(recipe.lean), random)
+        batch = self._other_bodies(triples, batch, random)
         if recipe.source_holes:
             batch = _cut(batch, recipe.source_holes, random)
         if recipe.vertices < 1:
@@ -75,6 +75,17 @@ class Augmentation:
             batch = of_other_proportions(batch, recipe.proportions, self._network.joints, random)
         if recipe.source_noise:
             batch = _noisy(batch, recipe.source_noise, random)
+        return batch
+
+    def _other_bodies(self, triples: Triples, batch: Batch, random: RowRandom) -> Batch:
+        """The batch in other poses, as points, turned."""
+        recipe = self._recipe
+        if recipe.recombined and self._bodies:
+            batch = self._bodies.recombined(triples, batch, recipe.recombined, random)
+        if recipe.points and self._rigs:
+            batch = self._rigs.of_points(triples, batch, recipe.points, random)
+        if recipe.turn or recipe.lean:
+            batch = _turned(batch, np.radians(recipe.turn), np.radians(recipe.lean), random)
         return batch
 
     def _told(self, triples: Triples, batch: Batch) -> Batch:

@@ -25,7 +25,7 @@ def matrices(numbers: Tensor) -> Tensor:
 
 def box(vertices: Tensor) -> tuple[Tensor, Tensor]:
     """Return the middle [b, 1, 3] and half the longest edge [b, 1, 1] of the boxes of vertices [b, n, 3]."""
-    low, high = torch.aminmax(vertices, dim=1, keepdim=True)
+    low, high = vertices.amin(dim=1, keepdim=True), vertices.amax(dim=1, keepdim=True)
     return (low + high) / 2, ((high - low) / 2).amax(dim=2, keepdim=True).clamp_min(1e-6)
 
 

@@ -10,6 +10,7 @@ from torch import nn
 from datagen.store import Dataset
 from training.data.augmentation.augment import Augmentation
 from training.data.cache_policy import Room
+from training.data.posed_bodies import PosedBodies
 from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
@@ -65,7 +66,8 @@ class TransferTask:
         """The training meshes, decoded, and the rigs of the bodies where a network learns from these."""
         with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
             rigs = agreed(ranks, lambda: self._rigs(device), what="read the rigs")
-            yield TripleFeed(self._recipe, self.order, bank, rigs, ranks)
+            bodies = agreed(ranks, lambda: self._bodies(device), what="read the rigs")
+            yield TripleFeed(self.order, bank, Augmentation(self._recipe, rigs, bodies), ranks, self._recipe.accumulate)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "TransferValidation":
         """Measures PMD on some of the dataset's evaluation triples."""
@@ -84,16 +86,20 @@ class TransferTask:
             return None
         return RigTable(dataset, dataset.identities("training"), network.joints, device=device)
 
+    def _bodies(self, device: torch.device) -> PosedBodies | None:
+        """By which poses are recombined; None where they are not."""
+        if not self._recipe.augmentation.recombined:
+            return None
+        return PosedBodies(self._dataset, self._dataset.identities("training"), device=device)
+
 
 class TripleFeed:
     """This rank's share of every step's triples, in parts, and their meshes on the device."""
 
-    def __init__(
-        self, recipe: TrainingRecipe, order: TripleOrder, bank: VertexBank, rigs: RigTable | None, ranks: Ranks
-    ) -> None:
+    def __init__(self, order: TripleOrder, bank: VertexBank, augment: Augmentation, ranks: Ranks, parts: int) -> None:
         self._order, self._bank, self.where = order, bank, bank.where
-        self._augment = Augmentation(recipe, rigs)
-        self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": recipe.accumulate}
+        self._augment = augment
+        self._mine = {"rank": ranks.rank, "ranks": ranks.count, "parts": parts}
 
     def batches(self, first_step: int) -> Shares:
         """See :class:`training.engine.tasks.protocol.Feed`."""

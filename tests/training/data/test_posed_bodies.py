@@ -1,0 +1,147 @@
+"""Recombined poses: meshes are what the rigs make of the joints' rotations, and these are of seen poses."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from datagen.common.errors import RecipeError
+from datagen.generate import generate
+from datagen.mesh.geometry import bounding_box
+from datagen.mesh.rig import rest_vertices, skinned, world_rotations
+from datagen.store import Dataset, open_dataset
+from tests.support.recipes import LEG, mixed_dataset, tiny_training
+from training.data.augmentation.augment import Augmentation
+from training.data.batch import Batch
+from training.data.posed_bodies import PosedBodies
+from training.data.rig_table import RigTable
+from training.data.vertex_bank import open_bank
+
+TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5], [0, 4, 2, 3]])
+
+
+@pytest.fixture
+def legs(dataset: str) -> Dataset:
+    return open_dataset(dataset)
+
+
+def recombined(legs: Dataset, share: float = 1.0, *, step: int = 3, first: int = 0, **augmentation: Any) -> Batch:
+    identities = legs.identities("training")
+    recipe = tiny_training(
+        network={"name": "parts", "joints": LEG, "width": 8, "token_width": 8, "blocks": 1},
+        augmentation={"subset": 24, **augmentation, "recombined": share},
+    )
+    rigs, bodies = (kind(legs, identities, device="cpu") for kind in (_leg_rigs, PosedBodies))
+    batch = open_bank(legs, identities).batch(TRIPLES[first:])
+    return Augmentation(recipe, rigs, bodies)(TRIPLES[first:], batch, step=step, first=first)
+
+
+def _leg_rigs(dataset: Dataset, identities: list[int], *, device: str) -> RigTable:
+    return RigTable(dataset, identities, LEG, device=device)
+
+
+def of_bodies_alone(legs: Dataset, share: float) -> tuple[Batch, Batch]:
+    """What the bank has of the triples, and what becomes of it."""
+    identities = legs.identities("training")
+    recipe = tiny_training(augmentation={"recombined": share})
+    batch = open_bank(legs, identities).batch(TRIPLES)
+    augment = Augmentation(recipe, bodies=PosedBodies(legs, identities, device="cpu"))
+    return batch, augment(TRIPLES, batch, step=3, first=0)
+
+
+def mesh(legs: Dataset, identity: int, turns: torch.Tensor) -> NDArray[np.float64]:
+    """A body by its rig, boxed, where the pose joints are turned so [joint, 3, 3]."""
+    rig = legs.rig(identity)
+    assert rig is not None
+    world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])[:5]
+    posed = legs.vertices(identity, np.arange(5)).astype(np.float64)
+    rest = rest_vertices(posed, rig.weights, rig.transforms(world))
+    vertices = skinned(rest, rig.weights, rig.transforms(turns[None].double().numpy()))[0]
+    return bounding_box(vertices).normalise(vertices)
+
+
+def local(turns: torch.Tensor, parents: list[int]) -> NDArray[np.float64]:
+    world = turns.double().numpy()
+    above = [np.eye(3) if parent < 0 else world[parent] for parent in parents]
+    return np.stack([own.T @ its for own, its in zip(above, world, strict=True)])
+
+
+@pytest.mark.parametrize("kind", ["alike", "mixed"])
+def test_meshes_are_what_the_rigs_make_of_rotations_of_seen_poses(kind: str, legs: Dataset, tmp_path: Any) -> None:
+    if kind == "mixed":
+        legs = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
+    before, batch = of_bodies_alone(legs, 1.0)
+    assert batch.turns is not None
+    parents, seen = legs.attributes["joint_parents"], legs.grid.poses("seen")
+    world = torch.from_numpy(world_rotations(legs.rotations(), parents))
+    known = [local(world[pose], parents) for pose in seen.tolist()]
+    combinations = set[tuple[int, ...]]()
+    for place, (source, _, target, _) in enumerate(TRIPLES.tolist()):
+        of_source, of_target = (turns[place] for turns in batch.turns)
+        for meshes, identity, turns in (
+            (batch.source, source, of_source),
+            (batch.target, target, of_target),
+            (batch.truth, target, of_source),
+        ):
+            count = legs.vertex_count(identity)
+            np.testing.assert_allclose(meshes[place, :count], mesh(legs, identity, turns), atol=2e-5)
+            assert not meshes[place, count:].any()
+        for turns in (of_source, of_target):
+            own = local(turns, parents)
+            away = np.array([np.abs(its - own).max(axis=(1, 2)) for its in known])
+            assert away.min(axis=0).max() < 1e-5
+            combinations.add(tuple(away.argmin(axis=0)[[1, 4]].tolist()))  # the hip and the knee
+    assert any(hip != knee for hip, knee in combinations)
+    assert before.edges is batch.edges and before.target_counts == batch.target_counts
+
+
+def test_a_share_of_none_changes_nothing_and_half_leaves_the_others(legs: Dataset) -> None:
+    before, batch = of_bodies_alone(legs, 0.5)
+    changed = (batch.source != before.source).flatten(1).any(dim=1)
+    assert changed.any() and not changed.all()
+    assert batch.turns is not None
+    world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])
+    for place in np.flatnonzero(~changed).tolist():
+        for meshes in ("source", "target", "truth"):
+            assert torch.equal(getattr(batch, meshes)[place], getattr(before, meshes)[place])
+        for turns, pose in zip(batch.turns, TRIPLES[place, [1, 3]], strict=True):
+            np.testing.assert_allclose(turns[place], world[pose], atol=1e-6)
+
+
+def test_the_parts_network_is_told_of_the_poses_that_the_meshes_are_in(legs: Dataset) -> None:
+    batch = recombined(legs, turn=20)
+    assert batch.posed is not None and batch.turns is not None
+    chosen = [legs.attributes["joints"].index(name) for name in LEG]
+    for posed, turns in zip(batch.posed, batch.turns, strict=True):
+        about = posed.rotations @ turns[:, chosen].mT  # the turn about the vertical, which all parts have
+        torch.testing.assert_close(about[:, 0], about[:, 1], atol=2e-3, rtol=0)
+        assert about[:, 0, 1, 1].min() > 0.9999
+
+
+def test_a_batch_in_two_parts_is_the_same(legs: Dataset) -> None:
+    whole, second = recombined(legs, 0.7, points=0.5), recombined(legs, 0.7, points=0.5, first=2)
+    for meshes in ("source", "target", "truth"):
+        torch.testing.assert_close(getattr(whole, meshes)[2:], getattr(second, meshes), atol=1e-6, rtol=0)
+    other = recombined(legs, 0.7, points=0.5, step=4)
+    assert not torch.allclose(other.source, whole.source)
+
+
+def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
+    rotations = legs.rotations().copy()
+    hip, knee = (legs.attributes["joints"].index(name) for name in LEG)
+    rotations[:, knee] = rotations[:, hip]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dataset, "rotations", lambda self: rotations)
+        _, batch = of_bodies_alone(legs, 1.0)
+    assert batch.turns is not None
+    for turns in torch.cat(batch.turns):
+        own = local(turns, legs.attributes["joint_parents"])
+        np.testing.assert_allclose(own[hip], own[knee], atol=1e-5)
+
+
+def test_a_dataset_without_rigs_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
+    with pytest.raises(RecipeError, match=r"augmentation\.recombined need rigs, but identity 0 of .* has none"):
+        PosedBodies(legs, [0], device="cpu")
