@@ -39,6 +39,20 @@ class LowPass:
                 found = found + np.where(self._free, share * (self._mean @ found - found), 0)
         return found
 
+    def roughness(self, vertices: Floats) -> float:
+        """Return how rough vertices [n, 3] are: below one on smooth surfaces, some 1.25 where all is noise.
+
+        How far a vertex lies from the mean of its neighbours, as a vector, changes little from one vertex to the next
+        on a smooth surface, and at random under noise. It is compared with the mean of its neighbours' in its turn: the
+        median over the vertices of by how much it differs, relative to its length. Open borders are left out; where
+        nothing else is left it is 0.
+        """
+        vertices = np.asarray(vertices, np.float64)
+        away = self._mean @ vertices - vertices
+        lengths, changes = (np.linalg.norm(each, axis=1) for each in (away, self._mean @ away - away))
+        some = self._free[:, 0] & (lengths > 0)
+        return float(np.median(changes[some] / lengths[some])) if some.any() else 0.0
+
 
 class LowPassWhereTorn:
     """The filter (:class:`LowPass`) where vertices lie further from their neighbours than at rest; the others stay.

@@ -1,18 +1,16 @@
 """What networks are given of meshes: vertices in their boxes, and what is near along surfaces, where they take that.
 
-A parts network poses the vertices of a mesh as they are, but may read them otherwise: through a low-pass filter along
-the edges (:mod:`datagen.mesh.low_pass`), where it understands the mesh better so, as one with noise. Outputs of people
-that are as finely meshed as their sources are then compared with these through the same filter, so that what it does to
-a body is no difference. Filtered people, and people of points, are read twice, as they are and as their mirror images
-(animals' rigs are not alike on both sides). Of a source of points up to 2,048 are read, of a mesh 1,024 vertices; a
-source that lists the vertices of its target in the same order is read at those at which the target is. A transfer reads
-its meshes so, and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise, do
-not; nor does what asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which parts
-an output is projected.
+A parts network poses the vertices of a mesh as they are, but reads rough ones, which have noise, through a low-pass
+filter along the edges (:mod:`datagen.mesh.low_pass`). Outputs of people that are as finely meshed as their sources are
+then compared with these through the same filter, so that what it does to a body is no difference. Filtered people, and
+people of points, are read twice, as they are and as their mirror images (animals' rigs are not alike on both sides). Of
+a source of points up to 2,048 are read, of a mesh 1,024 vertices; a source that lists the vertices of its target in the
+same order is read at those at which the target is. A transfer reads its meshes so, and what measures transfers of
+single meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands,
+whether it is a body, in which pose an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,25 +26,17 @@ from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 from training.recipes.networks import PEOPLE
 
-
-class _Filter(NamedTuple):
-    """How often a mesh is low-passed, and the share of its misfit below which that has to bring it, to be read so."""
-
-    times: int
-    left: float
-
-
-_STRONG, _WEAK = _Filter(8, 0.9), _Filter(2, 0.85)
-"""Of people, and of animals and coarse meshes, of which the former takes too much (docs/results/parts.md)."""
-_COARSE, _ALIKE = 500, 1.5
-"""Vertices of a mesh, up to which its filter is weak; how many times as many as the source a target may have, or the
-source as the target, where outputs are read through the strong filter, too.
+_ROUGH = 1.045
+"""Roughness from which a mesh is filtered (docs/results/parts.md)."""
+_WEAK = 2
+"""How often animals and coarse meshes are filtered, of which more takes too much."""
+_COARSE, _STEP, _LEAST, _MOST = 500, 600, 8, 64
+"""Vertices up to which a mesh is coarse; for how many vertices a person is filtered once, and how often at least and at
+most: the finer a mesh, the less a filter moves it.
 """
-_LOOKED_AT = 256
-"""Vertices by which the misfit is told."""
-_STILL = 0.008
-"""Root of the mean square over the vertices that are moved, half the longest edge of a mesh' box being 1, up to which a
-filter changes next to nothing: noise of 0.01 is moved by more.
+_ALIKE = 1.5
+"""How many times as many vertices as the source a target may have, or the source as the target, where outputs are read
+through a person's filter, too.
 """
 _MOST_POINTS = 2 * MOST_SAMPLED
 """Points of a source that are read at most: twice as many as of a mesh leave a tenth less error
@@ -147,19 +137,19 @@ def posed_targets(
     alike = torch.tensor([lists_alike(*both) for both in zip(sources, targets, strict=True)])
     if surface is None and not alike.all():
         surface = surface_of_meshes(sources).to(device_of(network))
-    vertices, filters = zip(*(_as_read(network, mesh) for mesh in sources), strict=True)
-    through = [LowPass(target.faces, len(target.vertices)) if _is_heard(chosen, source, target) else None
-               for chosen, source, target in zip(filters, sources, targets, strict=True)]  # fmt: skip
+    vertices, filtered = zip(*(_as_read(network, mesh) for mesh in sources), strict=True)
+    through = [LowPass(target.faces, len(target.vertices)) if _is_heard(times, source, target) else None
+               for times, source, target in zip(filtered, sources, targets, strict=True)]  # fmt: skip
 
     def heard(outputs: Tensor) -> Tensor:
         """Outputs [b, n, 3] as they are read, each as its source was."""
         rows = [output if low_pass is None
-                else torch.from_numpy(normalised(low_pass(output.double().cpu().numpy(), _STRONG.times))).to(output)
-                for low_pass, output in zip(through, outputs, strict=True)]  # fmt: skip
+                else torch.from_numpy(normalised(low_pass(output.double().cpu().numpy(), times))).to(output)
+                for low_pass, times, output in zip(through, filtered, outputs, strict=True)]  # fmt: skip
         return torch.stack(rows)
 
     of_people, of_points = network.joints == tuple(PEOPLE), torch.tensor([has_points(source) for source in sources])
-    twice = of_people & (of_points | torch.tensor([chosen is not None for chosen in filters]))
+    twice = of_people & (of_points | torch.tensor([times > 0 for times in filtered]))
     most = torch.where(of_points, _MOST_POINTS, MOST_SAMPLED)
     return network.posed_target(
         stacked(network, vertices),
@@ -172,27 +162,21 @@ def posed_targets(
     )
 
 
-def _is_heard(chosen: _Filter | None, source: Mesh, target: Mesh) -> bool:
+def _is_heard(times: int, source: Mesh, target: Mesh) -> bool:
     """Whether outputs are read through a source's filter, which does the same to both if they are as finely meshed."""
     few, many = sorted((len(source.vertices), len(target.vertices)))
-    return chosen is _STRONG and many <= _ALIKE * few
+    return times > _WEAK and many <= _ALIKE * few
 
 
-def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, _Filter | None]:
-    """The vertices [n, 3] of a mesh as they are, or where a low-pass filter leaves them; and which."""
+def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, int]:
+    """The vertices [n, 3] of a mesh, filtered if they are rough; and how often."""
     vertices = np.asarray(mesh.vertices, np.float64)
-    if not len(mesh.faces):
-        return vertices, None
-    chosen = _STRONG if network.joints == tuple(PEOPLE) and len(vertices) > _COARSE else _WEAK
-    filtered = LowPass(mesh.faces, len(vertices))(vertices, chosen.times)
-    moved = np.square(filtered - vertices).sum(axis=1)
-    moved = moved[moved > 0]  # points and open borders stay
-    if not len(moved) or np.sqrt(moved.mean()) <= _STILL * bounding_box(vertices).half:
-        return vertices, None
-    some = np.random.default_rng(0).permutation(len(vertices))[:_LOOKED_AT]
-    looked_at = stacked(network, [vertices, filtered])[:, some]
-    misfits = network.understood(looked_at)[0]
-    return (filtered, chosen) if bool(misfits[1] < chosen.left * misfits[0]) else (vertices, None)
+    low_pass = LowPass(mesh.faces, len(vertices))
+    if low_pass.roughness(vertices) <= _ROUGH:
+        return vertices, 0
+    is_fine = network.joints == tuple(PEOPLE) and len(vertices) > _COARSE
+    times = min(max(_LEAST, len(vertices) // _STEP), _MOST) if is_fine else _WEAK
+    return low_pass(vertices, times), times
 
 
 def _in_faces(mesh: Mesh) -> NDArray[np.bool_]:

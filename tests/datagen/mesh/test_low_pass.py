@@ -24,6 +24,21 @@ def test_noise_goes_and_size_stays() -> None:
     assert off(filtered(ball)) < 0.002
 
 
+def test_noise_is_told_from_shape() -> None:
+    """However large the mesh, however finely it is meshed, wherever it lies."""
+    for radius, subdivisions in ((0.5, 3), (500.0, 4), (0.5, 5)):
+        ball = sphere(radius=radius, subdivisions=subdivisions)
+        long = Mesh(ball.vertices * [1, 3, 0.7] + 2 * radius, ball.faces)
+        rough = [
+            LowPass(ball.faces, len(ball.vertices)).roughness(noisy(long, noise * radius).vertices)
+            for noise in (0.0, 0.03, 0.06)
+        ]
+        assert rough[0] < 1 < rough[1] < rough[2] < 1.3
+    faces = sphere(subdivisions=2).faces
+    assert LowPass(faces[:1], 162).roughness(sphere(subdivisions=2).vertices) == 0, "nothing but open borders"
+    assert LowPass(NO_FACES, 3).roughness(np.zeros((3, 3))) == 0
+
+
 def test_open_borders_and_vertices_without_faces_stay() -> None:
     ball = sphere(radius=0.5, subdivisions=3)
     half = noisy(Mesh(np.concatenate([ball.vertices, [[0, 2.0, 0]]]), ball.faces[: len(ball.faces) // 2]), 0.02)
