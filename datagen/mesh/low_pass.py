@@ -28,6 +28,7 @@ class LowPass:
         sides = (ahead + ahead.T).tocsr()  # how many faces each edge has
         neighbours = np.diff(sides.indptr)
         row = np.repeat(np.arange(count), neighbours)
+        self._faces = faces
         self._free = ((np.bincount(row, sides.data == 1, count) == 0) & (neighbours > 0))[:, None]
         self._mean = csr_array((1 / neighbours[row], sides.indices, sides.indptr), (count, count))
 
@@ -39,19 +40,25 @@ class LowPass:
                 found = found + np.where(self._free, share * (self._mean @ found - found), 0)
         return found
 
-    def roughness(self, vertices: Floats) -> float:
-        """Return how rough vertices [n, 3] are: below one on smooth surfaces, some 1.25 where all is noise.
+    def roughness(self, vertices: Floats) -> tuple[float, float]:
+        """Return how rough vertices [n, 3] are: below 0.9 on smooth surfaces, some 1.25 where all is noise.
 
-        How far a vertex lies from the mean of its neighbours, as a vector, changes little from one vertex to the next
-        on a smooth surface, and at random under noise. It is compared with the mean of its neighbours' in its turn: the
-        median over the vertices of by how much it differs, relative to its length. Open borders are left out; where
-        nothing else is left it is 0.
+        How far a vertex lies from the mean of its neighbours, along its normal, is much the same at its neighbours on a
+        smooth surface, however irregular the mesh, and differs at random under noise. Returned are the differences
+        relative to the distances, and the differences themselves in the unit of the vertices; of both the root of the
+        mean square. Vertices on open borders, of no face or that are not numbers are left out; (0, 0) without others.
         """
         vertices = np.asarray(vertices, np.float64)
-        away = self._mean @ vertices - vertices
-        lengths, changes = (np.linalg.norm(each, axis=1) for each in (away, self._mean @ away - away))
-        some = self._free[:, 0] & (lengths > 0)
-        return float(np.median(changes[some] / lengths[some])) if some.any() else 0.0
+        with np.errstate(invalid="ignore"):
+            one, two, three = vertices[self._faces].swapaxes(0, 1)
+            across, corners = np.tile(np.cross(two - one, three - one), (3, 1)), self._faces.T.ravel()
+            sums = np.stack([np.bincount(corners, each, len(vertices)) for each in across.T], axis=1)
+            normals = sums / np.linalg.norm(sums, axis=1, keepdims=True).clip(1e-300)
+            away = self._mean @ vertices - vertices
+            along, around = ((each * normals).sum(axis=1) for each in (away, self._mean @ away))
+        some = self._free[:, 0] & np.isfinite(along) & np.isfinite(around)
+        size, change = (np.sqrt(np.square(each[some]).sum()) for each in (along, around - along))
+        return (float(change / size), float(change / np.sqrt(some.sum()))) if size > 0 else (0.0, 0.0)
 
 
 class LowPassWhereTorn:

@@ -19,10 +19,12 @@ from training.networks.layers.rigid_parts import ancestors, skinned
 from training.networks.parts import boxed
 
 _POSES = 8  # of an identity, that its body at rest is found from
+_AT_ONCE = 2**25
+"""Skinning weights that are gathered at a time."""
 
 
 class PosedBodies:
-    """The bodies of some identities at rest, their rigs, and how the joints turn in the poses of the training grid.
+    """The bodies of some identities at rest, their rigs, and how the joints turn in a dataset's poses.
 
     Raises
     ------
@@ -38,8 +40,8 @@ class PosedBodies:
         rotations, seen = dataset.rotations(), dataset.grid.poses("seen")
         world = world_rotations(rotations, self._tree)
         self._world, self._local = self._floats(world), self._floats(_relative(world[seen], self._tree))
-        alike = _turning_alike(rotations[seen])
-        self._groups, self._group = int(alike.max()) + 1, torch.from_numpy(alike).to(self._device)
+        groups = _turning_alike(rotations[seen])
+        self._groups, self._group = int(groups.max()) + 1, torch.from_numpy(groups).to(self._device)
         rigs = [rig_of(dataset, int(identity)) for identity in identities]
         rest = [
             body_at_rest(dataset, int(identity), rig, world) for identity, rig in zip(identities, rigs, strict=True)
@@ -49,11 +51,14 @@ class PosedBodies:
         self._rest, self._of_rest = self._floats(np.concatenate(rest)), np.cumsum([0, *self._counts[:-1]])
         parts = max(len(rig.names) for rig in rigs)
         self._joints = self._floats(np.stack([_padded(rig.joints, parts) for rig in rigs]))
-        known = dict[tuple[object, ...], int]()
-        what_is_alike = [(rig.weights.tobytes(), rig.corrections.tobytes(), rig.drivers, rig.parents) for rig in rigs]
-        self._kinds = np.array([known.setdefault(its, len(known)) for its in what_is_alike])
-        kinds = [rigs[int(np.flatnonzero(self._kinds == kind)[0])] for kind in range(len(known))]
-        self._weights = self._floats(np.concatenate([_padded(rig.weights.T, parts).T for rig in kinds]))
+        kinds, known, numbers = list[Rig](), dict[tuple[object, ...], int](), list[int]()
+        for rig in rigs:
+            alike = rig.weights.tobytes(), rig.corrections.tobytes(), rig.drivers, rig.parents
+            numbers.append(known.setdefault(alike, len(known)))
+            if len(known) > len(kinds):
+                kinds.append(rig)
+        self._kinds = np.array(numbers)
+        self._weights = self._floats(np.concatenate([_wider(rig.weights, parts) for rig in kinds]))
         self._of_weights = np.cumsum([0, *(len(rig.weights) for rig in kinds[:-1])])[self._kinds]
         self._corrections = self._floats(np.stack([_padded(rig.corrections, parts) for rig in kinds]))
         self._drivers = self._numbers([[*rig.drivers, *[NO_JOINT] * (parts - len(rig.drivers))] for rig in kinds])
@@ -62,11 +67,12 @@ class PosedBodies:
         self._parents = self._numbers([[part if own < 0 else own for part, own in enumerate(tree)] for tree in trees])
 
     def recombined(self, triples: Triples, batch: Batch, share: float, random: RowRandom) -> Batch:
-        """The batch, this share of its triples, by chance, in poses that no mesh of the dataset is in.
+        """The batch, this share of its triples, by chance, in poses that are put together anew.
 
         Each joint is turned, relative to its parent, as in a seen pose of its own; joints that turn alike in all poses
         are turned as in one. The three meshes are what the dataset's would be: bodies by linear blend skinning, in
-        boxes of their own. ``turns`` of the batch says how all of its sources and targets are posed.
+        boxes of their own. ``turns`` of the batch says how all of its sources and targets are posed, where some are in
+        other poses than before.
 
         Parameters
         ----------
@@ -74,6 +80,8 @@ class PosedBodies:
             Those of the batch.
         """
         chosen = np.flatnonzero(random.on_host().uniform(Purpose.RECOMBINED).numpy() < share)
+        if not len(chosen):
+            return batch
         rows = sent(torch.from_numpy(chosen), self._device)
         poses = sent(torch.from_numpy(triples[:, [1, 3]].astype(np.int64)), self._device)
         drawn = random.below(Purpose.JOINT_POSES, len(self._local), 2, self._groups)
@@ -82,8 +90,12 @@ class PosedBodies:
         turns = self._world[poses].index_copy(0, rows, anew)
 
         def posed(meshes: Tensor, identities: NDArray[np.integer], its: Tensor) -> Tensor:
-            found = self._meshes(identities[chosen], its, rows=meshes.shape[1])
-            return meshes.index_copy(0, rows, found.to(meshes.dtype))
+            at_once = max(1, _AT_ONCE // (meshes.shape[1] * self._joints.shape[1]))
+            found = [
+                self._meshes(identities[chosen[start : start + at_once]], some, rows=meshes.shape[1])
+                for start, some in zip(range(0, len(chosen), at_once), torch.split(its, at_once), strict=True)
+            ]
+            return meshes.index_copy(0, rows, torch.cat(found).to(meshes.dtype))
 
         return replace(
             batch,
@@ -109,10 +121,9 @@ class PosedBodies:
         numbers, kind, of_rest, of_weights, count = sent(torch.from_numpy(about), self._device).unbind(0)
         places = torch.arange(rows, device=self._device).expand(len(own), -1)
         inside = places < count[:, None]
+        used = places.minimum(count[:, None] - 1)
         rest, weights = (
-            table.index_select(0, (first[:, None] + places.minimum(count[:, None] - 1)).flatten()).view(
-                *places.shape, -1
-            )
+            table.index_select(0, (first[:, None] + used).flatten()).view(*used.shape, table.shape[1])
             for table, first in ((self._rest, of_rest), (self._weights, of_weights))
         )
         meshes, parents = torch.arange(len(own), device=self._device)[:, None], self._parents[kind]
@@ -142,9 +153,9 @@ def rig_of(dataset: Dataset, identity: int) -> Rig:
     rig = dataset.rig(identity)
     if rig is None:
         raise RecipeError(
-            "training.network 'parts' and training.augmentation.recombined need rigs, but identity "
-            f"{identity} of {dataset.url} has none. Make a dataset of a body with a skeleton (anny, smpl, smal, "
-            "rigged), or train another network without it"
+            f"identity {identity} of {dataset.url} has no rig, which training.network 'parts' and "
+            "training.augmentation.recombined need. Make a dataset of a body with a skeleton (anny, smpl, smal, "
+            "rigged), or train another network with training.augmentation.recombined=0"
         )
     return rig
 
@@ -170,6 +181,11 @@ def _turning_alike(rotations: NDArray[np.float64]) -> NDArray[np.int64]:
     """Numbers [joint] of groups of joints, each of those that turn alike in all poses [pose, joint, 3]."""
     of_joints = rotations.swapaxes(0, 1).reshape(rotations.shape[1], -1)
     return np.unique(of_joints, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _wider(weights: NDArray[np.floating], parts: int) -> NDArray[np.floating]:
+    """Weights [vertex, n] with columns of zeros after them [vertex, parts]."""
+    return np.pad(weights, ((0, 0), (0, parts - weights.shape[1])))
 
 
 def _padded(values: NDArray[np.floating], count: int) -> NDArray[np.floating]:

@@ -26,8 +26,10 @@ from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 from training.recipes.networks import PEOPLE
 
-_ROUGH = 1.045
-"""Roughness from which a mesh is filtered (docs/results/parts.md)."""
+_ROUGH, _SLIGHT = 0.88, 0.003
+"""Roughness above which a mesh is filtered, and by how much vertices must differ from their neighbours, half the box'
+longest edge being 1: rounded coordinates do not matter (docs/results/parts.md).
+"""
 _WEAK = 2
 """How often animals and coarse meshes are filtered, of which more takes too much."""
 _COARSE, _STEP, _LEAST, _MOST = 500, 600, 8, 64
@@ -172,7 +174,8 @@ def _as_read(network: Parts, mesh: Mesh) -> tuple[Floats, int]:
     """The vertices [n, 3] of a mesh, filtered if they are rough; and how often."""
     vertices = np.asarray(mesh.vertices, np.float64)
     low_pass = LowPass(mesh.faces, len(vertices))
-    if low_pass.roughness(vertices) <= _ROUGH:
+    roughness, difference = low_pass.roughness(vertices)
+    if roughness <= _ROUGH or difference <= _SLIGHT * bounding_box(vertices).half:
         return vertices, 0
     is_fine = network.joints == tuple(PEOPLE) and len(vertices) > _COARSE
     times = min(max(_LEAST, len(vertices) // _STEP), _MOST) if is_fine else _WEAK

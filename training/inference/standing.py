@@ -55,6 +55,7 @@ _SURELY = 2.0, 6.0  # times less by a few vertices, of a mesh that is understood
 _SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
+_MORE_VERTICES = 512  # read of a mesh that is not understood as it is, before it is turned
 _FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
 _SIDES = 6  # of a box: directions along the axes
 _QUARTERS = np.radians([90.0, 180.0, 270.0])
@@ -119,6 +120,8 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     """
     ways = _Ways(understand, _probe(mesh))
     as_it_is = ways.seen([np.eye(3)])[0]
+    if as_it_is.misfit > KNOWN:
+        as_it_is = ways.seen([np.eye(3)], _MORE_VERTICES)[0]
     if as_it_is.misfit <= KNOWN and ways.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)

@@ -152,7 +152,8 @@ class AugmentationRecipe(Frozen):
         ge=0,
         le=1,
         description="share of the triples whose bodies are posed anew by the dataset's rigs, each joint turned as in a "
-        "pose of its own (joints that turn alike in all poses as in one)",
+        "pose of its own (joints that turn alike in all poses as in one); what rigs do not describe is left out, as "
+        "draped cloth",
     )
     shuffle: bool = Field(
         False,

@@ -1,10 +1,15 @@
 """The low-pass filter along the edges of a mesh, everywhere or where it is torn."""
 
+import warnings
+
 import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
 
 from datagen.mesh.geometry import Mesh
 from datagen.mesh.low_pass import LowPass, LowPassWhereTorn
 from tests.support.shapes.avatars import noisy, sphere
+from training.evaluation.disturbances import subdivide
 
 NO_FACES = np.zeros((0, 3), np.int64)
 
@@ -24,19 +29,45 @@ def test_noise_goes_and_size_stays() -> None:
     assert off(filtered(ball)) < 0.002
 
 
-def test_noise_is_told_from_shape() -> None:
+def roughness(mesh: Mesh) -> tuple[float, float]:
+    return LowPass(mesh.faces, len(mesh.vertices)).roughness(mesh.vertices)
+
+
+def uneven(count: int, seed: int) -> Mesh:
+    """A long ellipsoid whose vertices lie at random."""
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices
+    inside = np.einsum("fi,fi->f", points[faces[:, 0]], np.cross(*points[faces[:, 1:]].swapaxes(0, 1))) < 0
+    faces[inside] = faces[inside][:, ::-1]
+    return Mesh(points * [1, 3, 0.7], faces.astype(np.int64))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_noise_is_told_from_shape_and_from_uneven_meshing(unit: float) -> None:
     """However large the mesh, however finely it is meshed, wherever it lies."""
-    for radius, subdivisions in ((0.5, 3), (500.0, 4), (0.5, 5)):
-        ball = sphere(radius=radius, subdivisions=subdivisions)
-        long = Mesh(ball.vertices * [1, 3, 0.7] + 2 * radius, ball.faces)
-        rough = [
-            LowPass(ball.faces, len(ball.vertices)).roughness(noisy(long, noise * radius).vertices)
-            for noise in (0.0, 0.03, 0.06)
-        ]
-        assert rough[0] < 1 < rough[1] < rough[2] < 1.3
-    faces = sphere(subdivisions=2).faces
-    assert LowPass(faces[:1], 162).roughness(sphere(subdivisions=2).vertices) == 0, "nothing but open borders"
-    assert LowPass(NO_FACES, 3).roughness(np.zeros((3, 3))) == 0
+    smooth = [sphere(subdivisions=3), sphere(subdivisions=5), uneven(700, 0), uneven(5000, 1)]
+    smooth.append(subdivide(subdivide(sphere(subdivisions=2), 2, 0), 1, 0))
+    for mesh in smooth:
+        placed = Mesh(unit * (mesh.vertices + 2.0), mesh.faces)
+        values, differences = zip(*(roughness(noisy(placed, noise * unit)) for noise in (0.0, 0.03, 0.06)), strict=True)
+        assert values[0] < 0.88 < values[1] < values[2] + 0.01 < 1.3
+        assert 0.025 * unit < differences[1] < 0.06 * unit and 1.5 < differences[2] / differences[1] < 2.1
+    rounded = Mesh(smooth[1].vertices.round(4), smooth[1].faces)
+    assert roughness(rounded)[1] < 0.001, "however rough that is"
+
+
+def test_what_is_not_to_be_judged_is_left_out() -> None:
+    ball = sphere(subdivisions=3)
+    assert roughness(Mesh(ball.vertices, ball.faces[:1])) == (0, 0), "nothing but open borders"
+    assert roughness(Mesh(ball.vertices, NO_FACES)) == (0, 0)
+    assert roughness(Mesh(np.zeros((0, 3)), NO_FACES)) == (0, 0)
+    assert roughness(Mesh(np.zeros_like(ball.vertices), ball.faces)) == (0, 0)
+    broken = ball.vertices.copy()
+    broken[7], broken[300] = np.nan, np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert roughness(Mesh(broken, ball.faces)) == pytest.approx(roughness(ball), rel=0.05)
 
 
 def test_open_borders_and_vertices_without_faces_stay() -> None:

@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from datagen.common.errors import RecipeError
 from datagen.generate import generate
 from datagen.mesh.geometry import bounding_box
-from datagen.mesh.rig import rest_vertices, skinned, world_rotations
+from datagen.mesh.rig import Rig, rest_vertices, skinned, world_rotations
 from datagen.store import Dataset, open_dataset
-from tests.support.recipes import LEG, mixed_dataset, tiny_training
+from tests.support.recipes import LEG, PARTS, mixed_dataset, tiny_dataset, tiny_training
 from training.data.augmentation.augment import Augmentation
 from training.data.batch import Batch
+from training.data.cache_policy import Room
 from training.data.posed_bodies import PosedBodies
 from training.data.rig_table import RigTable
 from training.data.vertex_bank import open_bank
+from training.engine.distributed import Ranks
+from training.engine.tasks.transfer.transfer_task import TransferTask
 
 TRIPLES = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 1, 5], [0, 4, 2, 3]])
 
@@ -55,11 +58,33 @@ def mesh(legs: Dataset, identity: int, turns: torch.Tensor) -> NDArray[np.float6
     """A body by its rig, boxed, where the pose joints are turned so [joint, 3, 3]."""
     rig = legs.rig(identity)
     assert rig is not None
-    world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])[:5]
-    posed = legs.vertices(identity, np.arange(5)).astype(np.float64)
+    poses = legs.grid.poses_of(identity)[:8]
+    world = world_rotations(legs.rotations(), legs.attributes["joint_parents"])[poses]
+    posed = legs.vertices(identity, poses).astype(np.float64)
     rest = rest_vertices(posed, rig.weights, rig.transforms(world))
     vertices = skinned(rest, rig.weights, rig.transforms(turns[None].double().numpy()))[0]
     return bounding_box(vertices).normalise(vertices)
+
+
+def _with_another_part(rig_of: Any) -> Any:
+    """Rigs of which identity 1 has a part more that no joint turns, at the root, and half of some vertices' weight."""
+
+    def rig(dataset: Dataset, identity: int) -> Rig:
+        found = rig_of(dataset, identity)
+        if identity != 1:
+            return found
+        weights = np.concatenate([found.weights, np.zeros((len(found.weights), 1), np.float32)], axis=1)
+        weights[:9, -1], weights[:9, :-1] = 0.5, weights[:9, :-1] / 2
+        return Rig(
+            (*found.names, "stump"),
+            (*found.parents, -1),
+            (*found.drivers, -1),
+            np.concatenate([found.corrections, np.eye(3)[None]]),
+            weights,
+            np.concatenate([found.joints, found.joints[:1] + 0.1]),
+        )
+
+    return rig
 
 
 def local(turns: torch.Tensor, parents: list[int]) -> NDArray[np.float64]:
@@ -68,10 +93,17 @@ def local(turns: torch.Tensor, parents: list[int]) -> NDArray[np.float64]:
     return np.stack([own.T @ its for own, its in zip(above, world, strict=True)])
 
 
-@pytest.mark.parametrize("kind", ["alike", "mixed"])
-def test_meshes_are_what_the_rigs_make_of_rotations_of_seen_poses(kind: str, legs: Dataset, tmp_path: Any) -> None:
-    if kind == "mixed":
-        legs = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
+@pytest.mark.parametrize("kind", ["alike", "mixed", "grown", "other rigs"])
+def test_meshes_are_what_the_rigs_make_of_rotations_of_seen_poses(
+    kind: str, legs: Dataset, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen poses after unseen ones, where a dataset has grown; rigs of one identity that have another part."""
+    if kind in ("mixed", "grown"):
+        growth = [{"training": 1, "evaluation": 0, "seen": 5, "unseen": 1}] if kind == "grown" else []
+        recipe = tiny_dataset(growth=growth) if growth else mixed_dataset()
+        legs = open_dataset(generate(recipe, str(tmp_path / "legs.zarr")).url)
+    if kind == "other rigs":
+        monkeypatch.setattr(Dataset, "rig", _with_another_part(Dataset.rig))
     before, batch = of_bodies_alone(legs, 1.0)
     assert batch.turns is not None
     parents, seen = legs.attributes["joint_parents"], legs.grid.poses("seen")
@@ -97,7 +129,14 @@ def test_meshes_are_what_the_rigs_make_of_rotations_of_seen_poses(kind: str, leg
     assert before.edges is batch.edges and before.target_counts == batch.target_counts
 
 
-def test_a_share_of_none_changes_nothing_and_half_leaves_the_others(legs: Dataset) -> None:
+def test_where_none_is_chosen_nothing_changes(legs: Dataset) -> None:
+    before, batch = of_bodies_alone(legs, 1e-7)
+    assert batch is before and batch.turns is None
+    batch = recombined(legs, 1e-7)
+    assert batch.posed is not None
+
+
+def test_the_others_stay_as_they_are(legs: Dataset) -> None:
     before, batch = of_bodies_alone(legs, 0.5)
     changed = (batch.source != before.source).flatten(1).any(dim=1)
     assert changed.any() and not changed.all()
@@ -124,8 +163,35 @@ def test_a_batch_in_two_parts_is_the_same(legs: Dataset) -> None:
     whole, second = recombined(legs, 0.7, points=0.5), recombined(legs, 0.7, points=0.5, first=2)
     for meshes in ("source", "target", "truth"):
         torch.testing.assert_close(getattr(whole, meshes)[2:], getattr(second, meshes), atol=1e-6, rtol=0)
+    assert whole.turns is not None and second.turns is not None
+    assert all(torch.equal(one[2:], two) for one, two in zip(whole.turns, second.turns, strict=True))
     other = recombined(legs, 0.7, points=0.5, step=4)
-    assert not torch.allclose(other.source, whole.source)
+    assert other.turns is not None and not torch.allclose(other.turns[0], whole.turns[0])
+
+
+@pytest.mark.parametrize("accumulate", [1, 4])
+@pytest.mark.parametrize("cache", ["device", "stream"])
+def test_a_training_recombines_its_batches(legs: Dataset, accumulate: int, cache: str) -> None:
+    """Parts of a single triple, of which some have none that is chosen."""
+    augmentation = {"subset": 24, "recombined": 0.5}
+    recipe = tiny_training(
+        network=PARTS["network"], augmentation=augmentation, accumulate=accumulate, cache=cache, edge_weight=0
+    )
+    task = TransferTask(recipe, legs)
+    task.check(Room("test", 2**30, 1.0), 1)
+    with task.feed(Ranks(0, 1, 0), torch.device("cpu")) as feed:
+        shares = [next(batches) for batches in [feed.batches(0)] for _ in range(4)]
+    parts = [part for _, its in shares for part in its]
+    assert len(parts) == 4 * accumulate and any(part.turns for part in parts)
+    assert (accumulate == 1) or not all(part.turns for part in parts)
+    assert all(part.posed is not None and part.source.shape == (4 // accumulate, 24, 3) for part in parts)
+
+
+def test_the_papers_network_learns_from_recombined_poses_too(legs: Dataset) -> None:
+    task = TransferTask(tiny_training(augmentation={"recombined": 1.0}, precision="float64"), legs)
+    with task.feed(Ranks(0, 1, 0), torch.device("cpu")) as feed:
+        _, (batch,) = next(feed.batches(0))
+    assert batch.posed is None and batch.turns is not None and batch.surfaces is None
 
 
 def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
@@ -143,5 +209,5 @@ def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
 
 def test_a_dataset_without_rigs_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
-    with pytest.raises(RecipeError, match=r"augmentation\.recombined need rigs, but identity 0 of .* has none"):
+    with pytest.raises(RecipeError, match=r"identity 0 of .* has no rig, which .*augmentation\.recombined need"):
         PosedBodies(legs, [0], device="cpu")

@@ -96,7 +96,7 @@ def test_a_dataset_without_rigs_or_with_other_joints_is_refused(legs: Dataset, m
     with pytest.raises(RecipeError, match=r"names 'tail', which no pose of .* turns; its joints are pelvis, "):
         RigTable(legs, [0], {"left_hip": None, "tail": "left_hip"}, device="cpu")
     monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
-    with pytest.raises(RecipeError, match=r"identity 0 of .* has none\. Make a dataset of a body with a skeleton"):
+    with pytest.raises(RecipeError, match=r"identity 0 of .* has no rig, .*Make a dataset of a body with a skeleton"):
         table_of(legs)
 
 

@@ -10,7 +10,7 @@ from torch import nn
 from datagen.store import Dataset
 from training.data.augmentation.augment import Augmentation
 from training.data.cache_policy import Room
-from training.data.posed_bodies import PosedBodies
+from training.data.posed_bodies import PosedBodies, rig_of
 from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
@@ -47,7 +47,9 @@ class TransferTask:
         return order_of(self._recipe, self._dataset)
 
     def check(self, room: Room, ranks: int) -> None:
-        """See :func:`require_measurable`, :func:`require_step_memory`."""
+        """See :func:`require_measurable`, :func:`require_step_memory`; rigs that are needed must be there."""
+        if isinstance(self._recipe.network, PartsRecipe) or self._recipe.augmentation.recombined:
+            rig_of(self._dataset, self._dataset.identities("training")[0])  # before all meshes are decoded
         require_measurable(self._dataset, self._recipe)
         require_step_memory(self._recipe, self._dataset, room, ranks=ranks)
 
@@ -63,10 +65,10 @@ class TransferTask:
 
     @contextmanager
     def feed(self, ranks: Ranks, device: torch.device) -> Iterator["TripleFeed"]:
-        """The training meshes, decoded, and the rigs of the bodies where a network learns from these."""
+        """The training meshes, decoded, and the rigs where a network learns from them or poses are recombined."""
         with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
             rigs = agreed(ranks, lambda: self._rigs(device), what="read the rigs")
-            bodies = agreed(ranks, lambda: self._bodies(device), what="read the rigs")
+            bodies = agreed(ranks, lambda: self._bodies(device), what="find the bodies at rest")
             yield TripleFeed(self.order, bank, Augmentation(self._recipe, rigs, bodies), ranks, self._recipe.accumulate)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "TransferValidation":
