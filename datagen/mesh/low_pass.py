@@ -41,12 +41,13 @@ class LowPass:
         return found
 
     def roughness(self, vertices: Floats) -> tuple[float, float]:
-        """Return how rough vertices [n, 3] are: below 0.9 on smooth surfaces, some 1.25 where all is noise.
+        """Return how rough vertices [n, 3] are: 0.5 to 0.87 on smooth bodies, some 1.25 where all is noise.
 
         How far a vertex lies from the mean of its neighbours, along its normal, is much the same at its neighbours on a
         smooth surface, however irregular the mesh, and differs at random under noise. Returned are the differences
         relative to the distances, and the differences themselves in the unit of the vertices; of both the root of the
-        mean square. Vertices on open borders, of no face or that are not numbers are left out; (0, 0) without others.
+        mean square, where the largest twentieth, spikes say, counts as what is just below it. Vertices on open borders,
+        of no face or that are not numbers are not judged; (0, 0) without others.
         """
         vertices = np.asarray(vertices, np.float64)
         with np.errstate(invalid="ignore"):
@@ -57,8 +58,16 @@ class LowPass:
             away = self._mean @ vertices - vertices
             along, around = ((each * normals).sum(axis=1) for each in (away, self._mean @ away))
         some = self._free[:, 0] & np.isfinite(along) & np.isfinite(around)
-        size, change = (np.sqrt(np.square(each[some]).sum()) for each in (along, around - along))
-        return (float(change / size), float(change / np.sqrt(some.sum()))) if size > 0 else (0.0, 0.0)
+        if not some.any():
+            return 0.0, 0.0
+        size, change = (_typical(each[some]) for each in (along, around - along))
+        return (change / size, change) if size > 0 else (0.0, 0.0)
+
+
+def _typical(values: NDArray[np.float64]) -> float:
+    """Root of the mean square of values [n], the largest twentieth of which counts as what is just below it."""
+    sizes = np.abs(values)
+    return float(np.sqrt(np.square(sizes.clip(max=np.quantile(sizes, 0.95))).mean()))
 
 
 class LowPassWhereTorn:

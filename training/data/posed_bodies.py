@@ -142,22 +142,33 @@ class PosedBodies:
         return torch.tensor(values, device=self._device)
 
 
-def rig_of(dataset: Dataset, identity: int) -> Rig:
-    """The rig of an identity.
+def require_rigs(dataset: Dataset, identities: Sequence[int]) -> None:
+    """Raise if one of these identities has no rig; none is read.
 
     Raises
     ------
     RecipeError
-        It has none.
+        One has none.
     """
+    for identity in identities:
+        if dataset.rig_numbers[identity] < 0:
+            raise _no_rig(dataset, identity)
+
+
+def rig_of(dataset: Dataset, identity: int) -> Rig:
+    """The rig of an identity (RecipeError where it has none)."""
     rig = dataset.rig(identity)
     if rig is None:
-        raise RecipeError(
-            f"identity {identity} of {dataset.url} has no rig, which training.network 'parts' and "
-            "training.augmentation.recombined need. Make a dataset of a body with a skeleton (anny, smpl, smal, "
-            "rigged), or train another network with training.augmentation.recombined=0"
-        )
+        raise _no_rig(dataset, identity)
     return rig
+
+
+def _no_rig(dataset: Dataset, identity: int) -> RecipeError:
+    return RecipeError(
+        f"identity {identity} of {dataset.url} has no rig, which training.network 'parts' and "
+        "training.augmentation.recombined need. Make a dataset of a body with a skeleton (anny, smpl, smal, rigged), "
+        "or train another network with training.augmentation.recombined=0"
+    )
 
 
 def body_at_rest(dataset: Dataset, identity: int, rig: Rig, world: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 from training.recipes.networks import PEOPLE
 
-_ROUGH, _SLIGHT = 0.88, 0.003
+_ROUGH, _SLIGHT = 0.88, 0.004
 """Roughness above which a mesh is filtered, and by how much vertices must differ from their neighbours, half the box'
 longest edge being 1: rounded coordinates do not matter (docs/results/parts.md).
 """

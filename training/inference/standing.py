@@ -55,7 +55,7 @@ _SURELY = 2.0, 6.0  # times less by a few vertices, of a mesh that is understood
 _SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
-_MORE_VERTICES = 512  # read of a mesh that is not understood as it is, before it is turned
+_MORE_VERTICES = 512  # read of a mesh that is not understood as it is by fewer
 _FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
 _SIDES = 6  # of a box: directions along the axes
 _QUARTERS = np.radians([90.0, 180.0, 270.0])
@@ -115,13 +115,15 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     Parameters
     ----------
     mesh
-        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways, and to rule out the other quarter turns
-        of a mesh that is understood as it is.
+        Vertices [n, 3] in any unit; 256 of them are read, 512 where it is not understood as it is by those; 48 to rank
+        many ways, and to rule out the other quarter turns of a mesh that is understood as it is.
     """
-    ways = _Ways(understand, _probe(mesh))
+    points = _probe(mesh)
+    ways = _Ways(understand, points, _VERTICES)
     as_it_is = ways.seen([np.eye(3)])[0]
-    if as_it_is.misfit > KNOWN:
-        as_it_is = ways.seen([np.eye(3)], _MORE_VERTICES)[0]
+    if as_it_is.misfit > KNOWN and len(points) > _VERTICES:
+        ways = _Ways(understand, points, _MORE_VERTICES)
+        as_it_is = ways.seen([np.eye(3)])[0]
     if as_it_is.misfit <= KNOWN and ways.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
         return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
@@ -220,11 +222,12 @@ class _Seen(NamedTuple):
 class _Ways:
     """Ways to turn the points [n, 3] of a mesh, and what a network understands of it then."""
 
-    def __init__(self, understand: Understanding, points: Floats) -> None:
-        self._understand, self._points = understand, points
+    def __init__(self, understand: Understanding, points: Floats, vertices: int) -> None:
+        self._understand, self._points, self._vertices = understand, points, vertices
 
-    def seen(self, ways: Sequence[NDArray[np.float64]], vertices: int = _VERTICES) -> list[_Seen]:
-        misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T, vertices) for way in ways]))
+    def seen(self, ways: Sequence[NDArray[np.float64]], vertices: int | None = None) -> list[_Seen]:
+        read = vertices or self._vertices
+        misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T, read) for way in ways]))
         return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
 
     def none_is_clearer(self, seen: _Seen, others: Sequence[NDArray[np.float64]]) -> bool:

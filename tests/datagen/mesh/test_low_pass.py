@@ -53,8 +53,12 @@ def test_noise_is_told_from_shape_and_from_uneven_meshing(unit: float) -> None:
         values, differences = zip(*(roughness(noisy(placed, noise * unit)) for noise in (0.0, 0.03, 0.06)), strict=True)
         assert values[0] < 0.88 < values[1] < values[2] + 0.01 < 1.3
         assert 0.025 * unit < differences[1] < 0.06 * unit and 1.5 < differences[2] / differences[1] < 2.1
-    rounded = Mesh(smooth[1].vertices.round(4), smooth[1].faces)
-    assert roughness(rounded)[1] < 0.001, "however rough that is"
+    fine = sphere(subdivisions=6)
+    value, difference = roughness(Mesh(fine.vertices.round(3), fine.faces))
+    assert value > 0.88 and difference < 0.001, "rounded coordinates are rough, and make no difference"
+    spiked = sphere(subdivisions=4).vertices.copy()
+    spiked[::500] *= 1.5
+    assert roughness(Mesh(spiked, sphere(subdivisions=4).faces))[0] < 0.88, "a few spikes are no noise"
 
 
 def test_what_is_not_to_be_judged_is_left_out() -> None:

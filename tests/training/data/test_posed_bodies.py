@@ -132,8 +132,9 @@ def test_meshes_are_what_the_rigs_make_of_rotations_of_seen_poses(
 def test_where_none_is_chosen_nothing_changes(legs: Dataset) -> None:
     before, batch = of_bodies_alone(legs, 1e-7)
     assert batch is before and batch.turns is None
-    batch = recombined(legs, 1e-7)
-    assert batch.posed is not None
+    told, as_told = recombined(legs, 1e-7), recombined(legs, 0.0)
+    assert told.turns is None and told.posed is not None and as_told.posed is not None
+    assert torch.equal(told.source, as_told.source) and torch.equal(told.posed[0].joints, as_told.posed[0].joints)
 
 
 def test_the_others_stay_as_they_are(legs: Dataset) -> None:
@@ -194,6 +195,14 @@ def test_the_papers_network_learns_from_recombined_poses_too(legs: Dataset) -> N
     assert batch.posed is None and batch.turns is not None and batch.surfaces is None
 
 
+def test_bodies_are_posed_a_few_at_a_time(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, together = of_bodies_alone(legs, 1.0)
+    monkeypatch.setattr("training.data.posed_bodies._AT_ONCE", 1)
+    _, apart = of_bodies_alone(legs, 1.0)
+    for meshes in ("source", "target", "truth"):
+        torch.testing.assert_close(getattr(apart, meshes), getattr(together, meshes), atol=1e-6, rtol=0)
+
+
 def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
     rotations = legs.rotations().copy()
     hip, knee = (legs.attributes["joints"].index(name) for name in LEG)
@@ -205,6 +214,19 @@ def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
     for turns in torch.cat(batch.turns):
         own = local(turns, legs.attributes["joint_parents"])
         np.testing.assert_allclose(own[hip], own[knee], atol=1e-5)
+
+
+@pytest.mark.parametrize("changes", [PARTS, {"augmentation": {"recombined": 0.5}}, {}])
+def test_a_training_without_the_rigs_that_it_needs_is_refused_before_meshes_are_decoded(
+    changes: dict[str, Any], legs: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Dataset, "rig_numbers", np.array([0, 0, -1, -1, -1]))
+    task, room = TransferTask(tiny_training(**changes), legs), Room("test", 2**30, 1.0)
+    if not changes:
+        task.check(room, 1)
+        return
+    with pytest.raises(RecipeError, match=r"identity 2 of .* has no rig"):
+        task.check(room, 1)
 
 
 def test_a_dataset_without_rigs_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,6 +143,13 @@ def test_the_finer_a_person_is_meshed_the_more_often_it_is_filtered(subdivisions
     np.testing.assert_allclose(both[1] / both[1].max(), both[0] / both[0].max(), atol=1e-5)
 
 
+def test_rounded_coordinates_are_no_noise() -> None:
+    network, fine = lively("parts").eval(), sphere(subdivisions=6)
+    for mesh, filtered in ((Mesh(fine.vertices.round(3), fine.faces), False), (noisy(fine, 0.01), True)):
+        read = read_targets(network, [mesh])
+        assert torch.equal(read.as_read, read.vertices) != filtered
+
+
 def test_loose_vertices_do_not_make_a_mesh_smooth() -> None:
     network, rough = lively("parts").eval(), noisy(sphere(subdivisions=4), 0.02)
     loose = Mesh(np.tile(rough.vertices, (11, 1)), rough.faces)  # ten of eleven vertices have no face, and stay

@@ -57,6 +57,30 @@ def test_an_upright_body_is_left_exactly_as_it_is() -> None:
     assert np.array_equal(standing(understand, slightly).matrix, np.eye(3)), "it may be an error of the network's own"
 
 
+@pytest.mark.parametrize(("turned", "by_more"), [(0, 0.0005), (40, 0.0005), (0, 0.0030)])
+def test_a_mesh_that_few_vertices_do_not_understand_is_read_by_more_before_it_is_turned(
+    turned: int, by_more: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where 256 are too few, all that follows is read by 512; ways that few vertices like better are not taken."""
+    monkeypatch.setattr("training.inference.standing._VERTICES", 30)
+    monkeypatch.setattr("training.inference.standing._MORE_VERTICES", 60)
+    monkeypatch.setattr("training.inference.standing._FIRST_VERTICES", 20)
+    lean, read = Rotation.from_euler("x", 28, degrees=True), list[int]()
+
+    def confused(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        read.append(meshes.shape[1])
+        misfits, roots = understand(meshes)
+        if meshes.shape[1] == 60:
+            return misfits - 0.0005 + by_more, roots
+        leaning = np.array([(turn * lean.inv()).magnitude() for turn in turns_of(meshes)])
+        return 0.0025 + 0.02 * (1 - np.cos(leaning)), roots
+
+    found = standing(confused, Rotation.from_euler("y", turned, degrees=True).apply(BODY))
+    assert read[0] == 30 and 30 not in read[1:]
+    left = Rotation.from_matrix(found.lean.T @ found.matrix) * Rotation.from_euler("y", turned, degrees=True)
+    assert np.degrees(left.magnitude()) < 2
+
+
 @pytest.mark.parametrize(
     ("own", "times", "enough"), [(0.0005, 2.2, True), (0.0005, 1.8, False), (0.0015, 6.2, True), (0.0015, 5.8, False)]
 )

@@ -10,7 +10,7 @@ from torch import nn
 from datagen.store import Dataset
 from training.data.augmentation.augment import Augmentation
 from training.data.cache_policy import Room
-from training.data.posed_bodies import PosedBodies, rig_of
+from training.data.posed_bodies import PosedBodies, require_rigs
 from training.data.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
@@ -49,7 +49,7 @@ class TransferTask:
     def check(self, room: Room, ranks: int) -> None:
         """See :func:`require_measurable`, :func:`require_step_memory`; rigs that are needed must be there."""
         if isinstance(self._recipe.network, PartsRecipe) or self._recipe.augmentation.recombined:
-            rig_of(self._dataset, self._dataset.identities("training")[0])  # before all meshes are decoded
+            require_rigs(self._dataset, self._dataset.identities("training"))  # before all meshes are decoded
         require_measurable(self._dataset, self._recipe)
         require_step_memory(self._recipe, self._dataset, room, ranks=ranks)
 
