@@ -1,5 +1,6 @@
 """What a recipe and its assets make of a dataset before its meshes: attributes, small arrays, and where meshes go."""
 
+import contextlib
 import importlib.metadata
 import logging
 import uuid
@@ -58,10 +59,19 @@ def head_of(url: str, recipe: DatasetRecipe) -> Head:
     return Head(
         attributes=_attributes(recipe, body, source),
         provenance={
-            "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
+            "packages": _versions(),
             "git_commit": git("rev-parse", "HEAD") or "unknown",
         },
     )
+
+
+def _versions() -> dict[str, str]:
+    """Of the packages that meshes may come from, those that are installed: some machines have no body models."""
+    found = dict[str, str]()
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 def plan_of(

@@ -1,5 +1,6 @@
 """Generation as a pure function: any order, any interruption, any number of writers give the same bytes."""
 
+import importlib.metadata
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 from datagen import generate as generation
 from datagen.common.errors import BodyError, DatasetError
 from datagen.generate import ensure_shards, generate, inline, make_shard, shards
-from datagen.generate.plan import plan_of
+from datagen.generate.plan import head_of, plan_of
 from datagen.recipe import DatasetRecipe
 from datagen.store import open_dataset
 from datagen.store.location import writing_alone
@@ -209,3 +210,17 @@ def test_too_few_evaluation_triples_are_warned_of(
 ) -> None:
     plan_of(tiny_dataset(**changes))
     assert len(caplog.messages) == bool(says) and says in "".join(caplog.messages)
+
+
+def test_packages_that_are_not_installed_are_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine with a GPU and no body models."""
+    installed = importlib.metadata.version
+
+    def version(name: str) -> str:
+        if name == "anny":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return installed(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    packages = head_of("memory://x", tiny_dataset()).provenance["packages"]
+    assert "anny" not in packages and packages["numpy"] == np.__version__
