@@ -115,17 +115,18 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
     Parameters
     ----------
     mesh
-        Vertices [n, 3] in any unit; 256 of them are read, 512 where it is not understood as it is by those; 48 to rank
-        many ways, and to rule out the other quarter turns of a mesh that is understood as it is.
+        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways, and to rule out the other quarter turns
+        of a mesh that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave
+        less misfit, so that it stays so where that is in doubt.
     """
     points = _probe(mesh)
-    ways = _Ways(understand, points, _VERTICES)
+    ways = at_first = _Ways(understand, points, _VERTICES)
     as_it_is = ways.seen([np.eye(3)])[0]
     if as_it_is.misfit > KNOWN and len(points) > _VERTICES:
-        ways = _Ways(understand, points, _MORE_VERTICES)
-        as_it_is = ways.seen([np.eye(3)])[0]
-    if as_it_is.misfit <= KNOWN and ways.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
-        return ways.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
+        at_first = _Ways(understand, points, _MORE_VERTICES)
+        as_it_is = at_first.seen([np.eye(3)])[0]
+    if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
+        return at_first.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
     ahead = ways.ahead(best) if understood else None
