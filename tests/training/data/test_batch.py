@@ -16,7 +16,8 @@ from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_
 from training.data.augmentation.augment import Augmentation
 from training.data.augmentation.shuffle import Shuffle
 from training.data.batch import Batch, EdgeTable, PackedEdges, read_batch
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.rig_table import RigTable
 from training.data.triples import TripleOrder
 from training.data.vertex_bank import open_bank
 from training.networks.dsffnet import DSFFNet
@@ -155,7 +156,7 @@ def test_surfaces_are_those_of_each_mesh_alone(mixed: Dataset) -> None:
 def test_a_quarter_of_the_sources_is_not_told_the_same_ones_in_any_part(dataset: str) -> None:
     opened = open_dataset(dataset)
     triples = np.tile([[0, 1, 1, 2]], (64, 1))
-    table = RigTable(opened, opened.identities("training"), LEG, device="cpu")
+    table = RigTable(BodiesAtRest(opened, opened.identities("training")), LEG, device="cpu")
     augmentation = Augmentation(tiny_training(**PARTS), table)
     bank = open_bank(opened, opened.identities("training"))
     whole = augmentation(triples, bank.batch(triples), step=3, first=0).surfaces

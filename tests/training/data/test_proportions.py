@@ -11,7 +11,8 @@ from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation.augment import Augmentation
 from training.data.augmentation.proportions import of_other_proportions
 from training.data.batch import Batch
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.rig_table import RigTable
 from training.data.row_random import RowRandom
 from training.data.vertex_bank import open_bank
 from training.networks.layers.rigid_parts import ancestors, moved_joints, skinned
@@ -27,7 +28,7 @@ def legs(dataset: str) -> Dataset:
 
 @pytest.fixture
 def told(legs: Dataset) -> Batch:
-    table = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    table = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
     return table.posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
 
 
@@ -88,7 +89,7 @@ def test_bones_of_a_part_grow_with_it_and_none_at_all_without_a_deviation(told: 
 
 def test_a_batch_is_told_of_its_rigs_before_its_bodies_change_and_made_noisy_after(legs: Dataset) -> None:
     """What an augmentation does in a row fits together: vertices but for the noise are the bodies that are told of."""
-    table = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    table = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     about: dict[str, float] = {"subset": 24, "turn": 25, "source_holes": 0.3, "proportions": 0.3}
     quiet, noisy = (
@@ -113,7 +114,7 @@ def test_left_and_right_are_alike(legs: Dataset) -> None:
     joints = {"left_hip": None, "left_knee": "left_hip"}
     both: dict[str, str | None] = {"pelvis": None, **{a: b or "pelvis" for a, b in joints.items()}}
     both |= {a.replace("left", "right"): (b or "pelvis").replace("left", "right") for a, b in joints.items()}
-    table = RigTable(legs, legs.identities("training"), both, device="cpu")
+    table = RigTable(BodiesAtRest(legs, legs.identities("training")), both, device="cpu")
     told = table.posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
     assert told.posed is not None
     mirrored = told.posed[0].rest_joints * 0 + torch.randn(5, 3, generator=torch.Generator().manual_seed(0))

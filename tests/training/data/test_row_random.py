@@ -12,8 +12,9 @@ from datagen.store import open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation.augment import Augmentation, _drawn
 from training.data.batch import Batch
-from training.data.posed_bodies import PosedBodies
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.posed_bodies import PosedBodies
+from training.data.rigs.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom, _hashed
 from training.data.triples import TripleOrder
 from training.data.vertex_bank import open_bank
@@ -204,7 +205,9 @@ def augmented(dataset: str, *, step: int, device: str) -> Batch:
     recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 24, **changes}})
     (triples,) = next(TripleOrder(identities, legs.grid.poses("seen"), batch=16, seed=1).batches(first_step=step))
     batch = open_bank(legs, identities).batch(triples).to(device)
-    return Augmentation(recipe, RigTable(legs, identities, LEG, device=device))(triples, batch, step=step, first=0)
+    return Augmentation(recipe, RigTable(BodiesAtRest(legs, identities), LEG, device=device))(
+        triples, batch, step=step, first=0
+    )
 
 
 def alike(one: Batch, other: Batch) -> None:
@@ -224,7 +227,7 @@ def test_cuda_augments_as_the_cpu_does(
     dataset: str, monkeypatch: pytest.MonkeyPatch, step: int, most_sampled: int
 ) -> None:
     """At steps where it is not for rounding to say which of a round leg's vertices are the nearest to a hole."""
-    monkeypatch.setattr("training.data.rig_table.MOST_SAMPLED", most_sampled)
+    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", most_sampled)
     here, there = (augmented(dataset, step=step, device=device) for device in ("cpu", "cuda"))
     assert there.source.device.type == "cuda"
     alike(here, there.to("cpu"))
@@ -240,11 +243,9 @@ def test_cuda_recombines_poses_as_the_cpu_does(dataset: str) -> None:
     batch = open_bank(legs, identities).batch(triples)
     batches = []
     for device in ("cpu", "cuda"):
-        rigs, bodies = (
-            RigTable(legs, identities, LEG, device=device),
-            PosedBodies(legs, identities, device=device),
-        )
-        batches.append(Augmentation(recipe, rigs, bodies)(triples, batch.to(device), step=2, first=0).to("cpu"))
+        bodies = BodiesAtRest(legs, identities)
+        rigs, posed = RigTable(bodies, LEG, device=device), PosedBodies(bodies, device=device)
+        batches.append(Augmentation(recipe, rigs, posed)(triples, batch.to(device), step=2, first=0).to("cpu"))
     alike(*batches)
     for one, other in zip(*(its.turns or () for its in batches), strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-5)

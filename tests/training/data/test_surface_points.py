@@ -13,7 +13,8 @@ from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, MIXED_COUNTS, PARTS, mixed_dataset, tiny_training
 from training.data.augmentation.augment import Augmentation
 from training.data.batch import Batch
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom
 from training.data.surface_points import Triangles, points_of
 from training.data.vertex_bank import open_bank
@@ -39,7 +40,7 @@ def legs(dataset: str) -> Dataset:
 
 def surface_of_topology(legs: Dataset, identity: int) -> torch.Tensor:
     """The cell of each vertex."""
-    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    rigs = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
     triples = np.array([[identity, 0, identity, 0]])
     batch = rigs.posed(triples, open_bank(legs, legs.identities("training")).batch(triples))
     assert batch.surfaces is not None
@@ -47,7 +48,7 @@ def surface_of_topology(legs: Dataset, identity: int) -> torch.Tensor:
 
 
 def augmented(legs: Dataset, **changes: float) -> Batch:
-    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    rigs = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 24, **changes}})
     return Augmentation(recipe, rigs)(TRIPLES, batch, step=2, first=0)
@@ -143,10 +144,10 @@ def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
     legs: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     identities = legs.identities("training")
-    rigs = RigTable(legs, identities, LEG, device="cpu")
+    rigs = RigTable(BodiesAtRest(legs, identities), LEG, device="cpu")
     whole = open_bank(legs, identities).batch(TRIPLES)
     assert rigs.areas(TRIPLES, whole) == (None, None), "of so few vertices a network samples all"
-    monkeypatch.setattr("training.data.rig_table.MOST_SAMPLED", 10)
+    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", 10)
     recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 8}})
     drawn = [Augmentation(recipe, rigs)(TRIPLES, whole, step=step, first=0) for step in range(400)]
     of_sources, of_targets = rigs.areas(TRIPLES, whole)
@@ -175,11 +176,11 @@ def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
             self.areas = (torch.arange(len(vertices)) % 3 == len(kinds)).float()
             kinds.append(self)
 
-    monkeypatch.setattr("training.data.rig_table.Triangles", Striped)
+    monkeypatch.setattr("training.data.rigs.rig_table.Triangles", Striped)
     mixed = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
     identities = mixed.identities("training")
-    bank, rigs = open_bank(mixed, identities), RigTable(mixed, identities, LEG, device="cpu")
-    monkeypatch.setattr("training.data.rig_table.MOST_SAMPLED", most)
+    bank, rigs = open_bank(mixed, identities), RigTable(BodiesAtRest(mixed, identities), LEG, device="cpu")
+    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", most)
     assert [len(each.areas) for each in kinds] == [*MIXED_COUNTS], "as many topologies as there are kinds of legs"
     triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [3, 2, 0, 1]])
     dense = np.array([[mixed.vertex_count(int(own)) > most for own in pair] for pair in triples[:, [0, 2]]])
@@ -202,7 +203,7 @@ def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
 
 
 def test_about_as_many_are_points_as_the_recipe_says(legs: Dataset) -> None:
-    rigs = RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    rigs = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
     batch = open_bank(legs, legs.identities("training")).batch(TRIPLES)
     drawn = [rigs.of_points(TRIPLES, batch, 0.3, random(step, rows=3)) for step in range(60)]
     shares = [
@@ -222,7 +223,7 @@ def test_points_of_meshes_of_several_vertex_counts_are_turned_cut_and_thinned_li
     bank, identities = open_bank(mixed, mixed.identities("training")), mixed.identities("training")
     changes = {"subset": 24, "points": 1.0, "turn": 25, "lean": 40, "source_holes": 0.8}
     recipe = tiny_training(**{**PARTS, "augmentation": changes})
-    augment = Augmentation(recipe, RigTable(mixed, identities, LEG, device="cpu"))
+    augment = Augmentation(recipe, RigTable(BodiesAtRest(mixed, identities), LEG, device="cpu"))
     triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [4, 2, 0, 1]])
     plain = bank.batch(triples)
     assert plain.source_counts and plain.target_counts

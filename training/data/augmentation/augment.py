@@ -13,8 +13,8 @@ from torch.nn.functional import pad
 
 from training.data.augmentation.proportions import of_other_proportions
 from training.data.batch import Batch, Counts, counts_of
-from training.data.posed_bodies import PosedBodies
-from training.data.rig_table import RigTable
+from training.data.rigs.posed_bodies import PosedBodies
+from training.data.rigs.rig_table import RigTable
 from training.data.row_random import Purpose, RowRandom
 from training.data.triples import Triples
 from training.networks.execution import sent

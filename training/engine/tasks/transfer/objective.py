@@ -57,7 +57,7 @@ class PartsObjective(nn.Module):
         self.network = network
 
     def forward(self, batch: Batch, *, step: int) -> Losses:
-        """Return the losses of a batch that a :class:`training.data.rig_table.RigTable` was asked about."""
+        """Return the losses of a batch that a :class:`training.data.rigs.rig_table.RigTable` was asked about."""
         assert batch.posed is not None
         loss, parts = parts_loss(
             self.network,

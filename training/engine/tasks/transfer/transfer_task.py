@@ -10,8 +10,9 @@ from torch import nn
 from datagen.store import Dataset
 from training.data.augmentation.augment import Augmentation
 from training.data.cache_policy import Room
-from training.data.posed_bodies import PosedBodies, require_rigs
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest, require_rigs
+from training.data.rigs.posed_bodies import PosedBodies
+from training.data.rigs.rig_table import RigTable
 from training.data.triples import TripleOrder, order_of
 from training.data.vertex_bank import VertexBank, open_bank
 from training.engine.distributed import Ranks, agreed
@@ -48,7 +49,7 @@ class TransferTask:
 
     def check(self, room: Room, ranks: int) -> None:
         """See :func:`require_measurable`, :func:`require_step_memory`; rigs that are needed must be there."""
-        if isinstance(self._recipe.network, PartsRecipe) or self._recipe.augmentation.recombined:
+        if self._needs_rigs:
             require_rigs(self._dataset, self._dataset.identities("training"))  # before all meshes are decoded
         require_measurable(self._dataset, self._recipe)
         require_step_memory(self._recipe, self._dataset, room, ranks=ranks)
@@ -67,9 +68,8 @@ class TransferTask:
     def feed(self, ranks: Ranks, device: torch.device) -> Iterator["TripleFeed"]:
         """The training meshes, decoded, and the rigs where a network learns from them or poses are recombined."""
         with closing(agreed(ranks, lambda: self._bank(ranks, device), what="open the training meshes")) as bank:
-            rigs = agreed(ranks, lambda: self._rigs(device), what="read the rigs")
-            bodies = agreed(ranks, lambda: self._bodies(device), what="find the bodies at rest")
-            yield TripleFeed(self.order, bank, Augmentation(self._recipe, rigs, bodies), ranks, self._recipe.accumulate)
+            augment = agreed(ranks, lambda: self._augmentation(device), what="read the rigs")
+            yield TripleFeed(self.order, bank, augment, ranks, self._recipe.accumulate)
 
     def validation(self, device: torch.device, dtype: torch.dtype) -> "TransferValidation":
         """Measures PMD on some of the dataset's evaluation triples."""
@@ -81,18 +81,21 @@ class TransferTask:
         placed["block"] = self.order.memory(rank=ranks.rank, ranks=ranks.count)
         return open_bank(self._dataset, identities, edge_sum=recipe.edge_sum, **placed)
 
-    def _rigs(self, device: torch.device) -> RigTable | None:
-        """What a network learns from beside vertices; None where it learns from these alone."""
-        network, dataset = self._recipe.network, self._dataset
-        if not isinstance(network, PartsRecipe):
-            return None
-        return RigTable(dataset, dataset.identities("training"), network.joints, device=device)
+    @property
+    def _needs_rigs(self) -> bool:
+        return isinstance(self._recipe.network, PartsRecipe) or self._recipe.augmentation.recombined > 0
 
-    def _bodies(self, device: torch.device) -> PosedBodies | None:
-        """By which poses are recombined; None where they are not."""
-        if not self._recipe.augmentation.recombined:
-            return None
-        return PosedBodies(self._dataset, self._dataset.identities("training"), device=device)
+    def _augmentation(self, device: torch.device) -> Augmentation:
+        """With what a network learns from beside vertices, and by which poses are recombined, where the recipe says."""
+        recipe, dataset = self._recipe, self._dataset
+        if not self._needs_rigs:
+            return Augmentation(recipe)
+        bodies = BodiesAtRest(dataset, dataset.identities("training"))
+        rigs = (
+            RigTable(bodies, recipe.network.joints, device=device) if isinstance(recipe.network, PartsRecipe) else None
+        )
+        posed = PosedBodies(bodies, device=device) if recipe.augmentation.recombined else None
+        return Augmentation(recipe, rigs, posed)
 
 
 class TripleFeed:

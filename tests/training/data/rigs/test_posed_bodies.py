@@ -16,8 +16,9 @@ from tests.support.recipes import LEG, PARTS, mixed_dataset, tiny_dataset, tiny_
 from training.data.augmentation.augment import Augmentation
 from training.data.batch import Batch
 from training.data.cache_policy import Room
-from training.data.posed_bodies import PosedBodies
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.posed_bodies import PosedBodies
+from training.data.rigs.rig_table import RigTable
 from training.data.vertex_bank import open_bank
 from training.engine.distributed import Ranks
 from training.engine.tasks.transfer.transfer_task import TransferTask
@@ -36,13 +37,10 @@ def recombined(legs: Dataset, share: float = 1.0, *, step: int = 3, first: int =
         network={"name": "parts", "joints": LEG, "width": 8, "token_width": 8, "blocks": 1},
         augmentation={"subset": 24, **augmentation, "recombined": share},
     )
-    rigs, bodies = (kind(legs, identities, device="cpu") for kind in (_leg_rigs, PosedBodies))
+    bodies = BodiesAtRest(legs, identities)
+    rigs, posed = RigTable(bodies, LEG, device="cpu"), PosedBodies(bodies, device="cpu")
     batch = open_bank(legs, identities).batch(TRIPLES[first:])
-    return Augmentation(recipe, rigs, bodies)(TRIPLES[first:], batch, step=step, first=first)
-
-
-def _leg_rigs(dataset: Dataset, identities: list[int], *, device: str) -> RigTable:
-    return RigTable(dataset, identities, LEG, device=device)
+    return Augmentation(recipe, rigs, posed)(TRIPLES[first:], batch, step=step, first=first)
 
 
 def of_bodies_alone(legs: Dataset, share: float) -> tuple[Batch, Batch]:
@@ -50,7 +48,7 @@ def of_bodies_alone(legs: Dataset, share: float) -> tuple[Batch, Batch]:
     identities = legs.identities("training")
     recipe = tiny_training(augmentation={"recombined": share})
     batch = open_bank(legs, identities).batch(TRIPLES)
-    augment = Augmentation(recipe, bodies=PosedBodies(legs, identities, device="cpu"))
+    augment = Augmentation(recipe, bodies=PosedBodies(BodiesAtRest(legs, identities), device="cpu"))
     return batch, augment(TRIPLES, batch, step=3, first=0)
 
 
@@ -197,7 +195,7 @@ def test_the_papers_network_learns_from_recombined_poses_too(legs: Dataset) -> N
 
 def test_bodies_are_posed_a_few_at_a_time(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     _, together = of_bodies_alone(legs, 1.0)
-    monkeypatch.setattr("training.data.posed_bodies._AT_ONCE", 1)
+    monkeypatch.setattr("training.data.rigs.posed_bodies._AT_ONCE", 1)
     _, apart = of_bodies_alone(legs, 1.0)
     for meshes in ("source", "target", "truth"):
         torch.testing.assert_close(getattr(apart, meshes), getattr(together, meshes), atol=1e-6, rtol=0)
@@ -220,16 +218,10 @@ def test_joints_that_turn_alike_stay_together(legs: Dataset) -> None:
 def test_a_training_without_the_rigs_that_it_needs_is_refused_before_meshes_are_decoded(
     changes: dict[str, Any], legs: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Dataset, "rig_numbers", np.array([0, 0, -1, -1, -1]))
+    monkeypatch.setitem(vars(legs), "rig_numbers", np.array([0, 0, -1, -1, -1]))
     task, room = TransferTask(tiny_training(**changes), legs), Room("test", 2**30, 1.0)
     if not changes:
         task.check(room, 1)
         return
     with pytest.raises(RecipeError, match=r"identity 2 of .* has no rig"):
         task.check(room, 1)
-
-
-def test_a_dataset_without_rigs_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
-    with pytest.raises(RecipeError, match=r"identity 0 of .* has no rig, which .*augmentation\.recombined need"):
-        PosedBodies(legs, [0], device="cpu")

@@ -8,56 +8,38 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datagen.common.errors import RecipeError
-from datagen.mesh.rig import NO_JOINT, Rig, rest_vertices, world_rotations
-from datagen.store import Dataset
+from datagen.mesh.rig import NO_JOINT, Rig
 from training.data.batch import Batch
+from training.data.rigs.bodies_at_rest import BodiesAtRest
 from training.data.row_random import Purpose, RowRandom
 from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers.rigid_parts import ancestors, skinned
 from training.networks.parts import boxed
 
-_POSES = 8  # of an identity, that its body at rest is found from
 _AT_ONCE = 2**25
 """Skinning weights that are gathered at a time."""
 
 
 class PosedBodies:
-    """The bodies of some identities at rest, their rigs, and how the joints turn in a dataset's poses.
+    """Bodies by their rigs, and how the joints turn in a dataset's poses, on a device.
 
-    Raises
-    ------
-    RecipeError
-        An identity has no rig.
-    DatasetError
-        The dataset is damaged.
+    Rigs may have different parts; those of fewer are padded with parts that move no vertex.
     """
 
-    def __init__(self, dataset: Dataset, identities: Sequence[int], *, device: torch.device | str) -> None:
-        self._device = torch.device(device)
+    def __init__(self, bodies: BodiesAtRest, *, device: torch.device | str) -> None:
+        dataset, rigs = bodies.dataset, bodies.rigs
+        self._device, seen = torch.device(device), dataset.grid.poses("seen")
         self._tree: list[int] = list(dataset.attributes["joint_parents"])
-        rotations, seen = dataset.rotations(), dataset.grid.poses("seen")
-        world = world_rotations(rotations, self._tree)
-        self._world, self._local = self._floats(world), self._floats(_relative(world[seen], self._tree))
-        groups = _turning_alike(rotations[seen])
+        self._world, self._local = self._floats(bodies.world), self._floats(_relative(bodies.world[seen], self._tree))
+        groups = _turning_alike(dataset.rotations()[seen])
         self._groups, self._group = int(groups.max()) + 1, torch.from_numpy(groups).to(self._device)
-        rigs = [rig_of(dataset, int(identity)) for identity in identities]
-        rest = [
-            body_at_rest(dataset, int(identity), rig, world) for identity, rig in zip(identities, rigs, strict=True)
-        ]
-        self._row = {int(identity): row for row, identity in enumerate(identities)}
-        self._counts = np.array([len(its) for its in rest])
-        self._rest, self._of_rest = self._floats(np.concatenate(rest)), np.cumsum([0, *self._counts[:-1]])
+        self._row = {identity: row for row, identity in enumerate(bodies.identities)}
+        self._counts = np.array([len(its) for its in bodies.vertices])
+        self._rest, self._of_rest = self._floats(np.concatenate(bodies.vertices)), np.cumsum([0, *self._counts[:-1]])
         parts = max(len(rig.names) for rig in rigs)
         self._joints = self._floats(np.stack([_padded(rig.joints, parts) for rig in rigs]))
-        kinds, known, numbers = list[Rig](), dict[tuple[object, ...], int](), list[int]()
-        for rig in rigs:
-            alike = rig.weights.tobytes(), rig.corrections.tobytes(), rig.drivers, rig.parents
-            numbers.append(known.setdefault(alike, len(known)))
-            if len(known) > len(kinds):
-                kinds.append(rig)
-        self._kinds = np.array(numbers)
+        kinds, self._kinds = _kinds_of(rigs)
         self._weights = self._floats(np.concatenate([_wider(rig.weights, parts) for rig in kinds]))
         self._of_weights = np.cumsum([0, *(len(rig.weights) for rig in kinds[:-1])])[self._kinds]
         self._corrections = self._floats(np.stack([_padded(rig.corrections, parts) for rig in kinds]))
@@ -142,43 +124,15 @@ class PosedBodies:
         return torch.tensor(values, device=self._device)
 
 
-def require_rigs(dataset: Dataset, identities: Sequence[int]) -> None:
-    """Raise if one of these identities has no rig; none is read.
-
-    Raises
-    ------
-    RecipeError
-        One has none.
-    """
-    for identity in identities:
-        if dataset.rig_numbers[identity] < 0:
-            raise _no_rig(dataset, identity)
-
-
-def rig_of(dataset: Dataset, identity: int) -> Rig:
-    """The rig of an identity (RecipeError where it has none)."""
-    rig = dataset.rig(identity)
-    if rig is None:
-        raise _no_rig(dataset, identity)
-    return rig
-
-
-def _no_rig(dataset: Dataset, identity: int) -> RecipeError:
-    return RecipeError(
-        f"identity {identity} of {dataset.url} has no rig, which training.network 'parts' and "
-        "training.augmentation.recombined need. Make a dataset of a body with a skeleton (anny, smpl, smal, rigged), "
-        "or train another network with training.augmentation.recombined=0"
-    )
-
-
-def body_at_rest(dataset: Dataset, identity: int, rig: Rig, world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vertices [vertex, 3] in metres at the rest of an identity's rig, from its first meshes.
-
-    ``world``: :func:`datagen.mesh.rig.world_rotations` of all poses.
-    """
-    poses = dataset.grid.poses_of(identity)[:_POSES]
-    posed = dataset.vertices(identity, poses).astype(np.float64)
-    return rest_vertices(posed, rig.weights, rig.transforms(world[poses]))
+def _kinds_of(rigs: Sequence[Rig]) -> tuple[list[Rig], NDArray[np.int64]]:
+    """One rig of each kind, whose bodies differ in shape alone, and the number of the kind of each."""
+    kinds, known, numbers = list[Rig](), dict[tuple[object, ...], int](), list[int]()
+    for rig in rigs:
+        alike = rig.weights.tobytes(), rig.corrections.tobytes(), rig.drivers, rig.parents
+        numbers.append(known.setdefault(alike, len(known)))
+        if len(known) > len(kinds):
+            kinds.append(rig)
+    return kinds, np.array(numbers)
 
 
 def _relative(world: NDArray[np.float64], parents: Sequence[int]) -> NDArray[np.float64]:

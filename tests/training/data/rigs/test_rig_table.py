@@ -12,7 +12,8 @@ from datagen.mesh.rig import world_rotations
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation.augment import Augmentation
-from training.data.rig_table import RigTable
+from training.data.rigs.bodies_at_rest import BodiesAtRest
+from training.data.rigs.rig_table import RigTable
 from training.data.vertex_bank import open_bank
 from training.networks.layers.surface import surface_of
 
@@ -25,7 +26,7 @@ def legs(dataset: str) -> Dataset:
 
 
 def table_of(legs: Dataset) -> RigTable:
-    return RigTable(legs, legs.identities("training"), LEG, device="cpu")
+    return RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
 
 
 @pytest.mark.parametrize(("turn", "lean"), [(0, 0), (25, 0), (25, 40)])
@@ -86,7 +87,7 @@ def test_bodies_rest_at_their_root_in_their_own_size(legs: Dataset) -> None:
 
 def test_a_part_that_a_body_lacks_is_said_to_be_absent(legs: Dataset) -> None:
     joints = {**LEG, "left_ankle": "left_knee"}
-    table = RigTable(legs, legs.identities("training"), joints, device="cpu")
+    table = RigTable(BodiesAtRest(legs, legs.identities("training")), joints, device="cpu")
     batch = table.posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
     assert batch.posed is not None
     assert torch.equal(batch.posed[0].present, torch.tensor([[1.0, 1, 0]] * 3))
@@ -94,8 +95,8 @@ def test_a_part_that_a_body_lacks_is_said_to_be_absent(legs: Dataset) -> None:
 
 def test_a_dataset_without_rigs_or_with_other_joints_is_refused(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RecipeError, match=r"names 'tail', which no pose of .* turns; its joints are pelvis, "):
-        RigTable(legs, [0], {"left_hip": None, "tail": "left_hip"}, device="cpu")
-    monkeypatch.setattr(Dataset, "rig", lambda self, identity: None)
+        RigTable(BodiesAtRest(legs, [0]), {"left_hip": None, "tail": "left_hip"}, device="cpu")
+    monkeypatch.setitem(vars(legs), "rig_numbers", np.full(5, -1))
     with pytest.raises(RecipeError, match=r"identity 0 of .* has no rig, .*Make a dataset of a body with a skeleton"):
         table_of(legs)
 

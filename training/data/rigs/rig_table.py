@@ -3,7 +3,7 @@
 Parts are joined as the network has them: bones that one pose joint turns are one part, as the fingers of a hand are.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +13,9 @@ from torch import Tensor
 
 from datagen.common.errors import RecipeError
 from datagen.mesh.geometry import edges_of
-from datagen.mesh.rig import Rig, skinned, world_rotations
-from datagen.store import Dataset
+from datagen.mesh.rig import Rig, skinned
 from training.data.batch import Batch
-from training.data.posed_bodies import body_at_rest, rig_of
+from training.data.rigs.bodies_at_rest import BodiesAtRest
 from training.data.row_random import Purpose, RowRandom
 from training.data.surface_points import SurfacePoints, Triangles, points_of
 from training.data.triples import Triples
@@ -42,20 +41,13 @@ class RigTable:
     Raises
     ------
     RecipeError
-        An identity has no rig, or one whose joints are others.
+        The dataset's poses do not turn one of the joints.
     DatasetError
         The dataset is damaged.
     """
 
-    def __init__(
-        self,
-        dataset: Dataset,
-        identities: Sequence[int],
-        joints: Mapping[str, str | None],
-        *,
-        device: torch.device | str,
-    ) -> None:
-        self._dataset, self._names = dataset, tuple(joints)
+    def __init__(self, bodies: BodiesAtRest, joints: Mapping[str, str | None], *, device: torch.device | str) -> None:
+        dataset, self._names = bodies.dataset, tuple(joints)
         parents = [-1 if parent is None else self._names.index(parent) for parent in joints.values()]
         self._parents = torch.tensor([part if own < 0 else own for part, own in enumerate(parents)], device=device)
         self._above = ancestors(parents).to(device)
@@ -66,25 +58,24 @@ class RigTable:
                 f"training.network.joints names {unknown[0]!r}, which no pose of {dataset.url} turns; its joints are "
                 f"{', '.join(self._poses)}. Name those that the bodies have: --set training.network.joints=..."
             )
-        world = world_rotations(dataset.rotations(), dataset.attributes["joint_parents"])
-        self._turns, self._world = world, torch.from_numpy(world.astype(np.float32)).to(device)
+        self._world = torch.from_numpy(bodies.world.astype(np.float32)).to(device)
         self._chosen = torch.tensor([self._poses.index(name) for name in self._names], device=device)
         self._device, self._row = torch.device(device), dict[int, int]()
         weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
         surfaces, triangles = list[Surface](), list[Triangles]()
         kinds, known = list[int](), dict[bytes, int]()
-        for identity in identities:
-            its_weights, its_rest, its_joints = self._of_identity(int(identity))
+        for identity, rig, vertices in zip(bodies.identities, bodies.rigs, bodies.vertices, strict=True):
+            its_weights, its_rest, its_joints = self._in_the_poses_rest(rig, vertices)
             kind = known.setdefault(its_weights.tobytes(), len(known))
             if kind == len(weights):
                 weights.append(torch.from_numpy(its_weights).to(device))
-                faces = dataset.faces(int(identity))
+                faces = dataset.faces(identity)
                 surfaces.append(surface_of(its_rest, edges_of(faces)))
                 triangles.append(Triangles(its_rest, faces, device=self._device))
             kinds.append(kind)
             rest.append(torch.from_numpy(its_rest).to(device))
             at.append(its_joints)
-            self._row[int(identity)] = len(rest) - 1
+            self._row[identity] = len(rest) - 1
         self._kinds, self._triangles = kinds, triangles
         self._weights, self._rest = torch.cat(weights), torch.cat(rest)
         self._areas = torch.cat([its.areas for its in triangles])
@@ -217,11 +208,11 @@ class RigTable:
             weights, rest, posed = (points.mixed(each) for each in (weights, rest, posed))
         return Posed(weights, rest, joints, *_carried(posed, vertices, turns, moved), present)
 
-    def _of_identity(self, identity: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Weights [vertex, part] and, in the poses' rest pose and box units, vertices and joints of an identity."""
-        rig = rig_of(self._dataset, identity)
-        rest = body_at_rest(self._dataset, identity, rig, self._turns)
-        still = rig.transforms(np.broadcast_to(np.eye(3), (1, *self._turns.shape[1:])))
+    def _in_the_poses_rest(
+        self, rig: Rig, rest: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Weights [vertex, part] and, in the poses' rest pose and box units, vertices and joints of a body at rest."""
+        still = rig.transforms(np.broadcast_to(np.eye(3), (1, len(self._poses), 3, 3)))
         vertices = skinned(rest, rig.weights, still)[0]
         joints = (still[0, :, :, :3] @ rig.joints[..., None])[..., 0] + still[0, :, :, 3]
         owner = self._owners(rig)
