@@ -1,8 +1,9 @@
 """What it costs that meshes are not sampled alike: ``python -m benchmarks.transfer.samplings human COARSE FINE``.
 
 The same people in the same poses as two datasets of one recipe, coarse and fine (docs/results/parts.md). Transfers
-within each, where source and target list the same vertices; between both; and from points of the fine meshes, even by
-area, onto either. PMD, medians in brackets. 200 triples of the quickstart's people take ten minutes of one core.
+within each, where source and target list the same vertices; between both; the same with noise in the source; and from
+points of the fine meshes, even by area, onto either. PMD, medians in brackets. 200 triples of the quickstart's people
+take twenty minutes of one core.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from dataclasses import replace
 import numpy as np
 
 from datagen.store import open_dataset
-from training.evaluation.disturbances import resample_by_area
+from training.evaluation.disturbances import add_noise, resample_by_area
 from training.evaluation.measure import transfer_each
 from training.evaluation.robustness import Case, case_of, first_triples
 from training.inference.predict import load_trained
 from training.objectives import PMD_UNIT
 from workflows.pretrained import weights_named
 
+_NOISE = (0.01, 0.02, 0.04)
+"""Standard deviations, half the longest box edge being 1."""
 _POINTS = (615, 1230, 2460, 4920, 13718)
 
 
@@ -51,9 +54,17 @@ def main() -> None:
     }
     for (one, other), cases in pairs.items():
         row(f"{one} > {other}", cases)
+    for noise in _NOISE:
+        for (one, other), cases in pairs.items():
+            row(f"{one}, noise of {noise} > {other}", [with_noise(case, noise) for case in cases])
     for count in _POINTS:
         for other in ("coarse", "fine"):
             row(f"{count:,} points > {other}", [as_points(case, count) for case in pairs["fine", other]])
+
+
+def with_noise(case: Case, deviation: float) -> Case:
+    """A transfer from its source with noise, the same each time."""
+    return replace(case, source=add_noise(case.source, deviation, case.number))
 
 
 def as_points(case: Case, count: int) -> Case:
