@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from datagen.common.errors import RecipeError, UnsafeFileError, reason_of
 from datagen.common.files import read_bounded
+from datagen.common.printable import nearest
 from datagen.recipe.plain_yaml import load_yaml
 
 _LONGEST = 1_000_000
@@ -138,6 +139,11 @@ def faults_text(error: ValidationError, describe: "Callable[[Any], str] | None" 
 def fault_text(fault: Any, *, key: str | None = None) -> str:
     """Return one fault in words: the key, what is wrong, and the value that was given."""
     key = _cut(".".join(map(str, fault["loc"]))) if key is None else key
+    if fault["type"] == "union_tag_invalid":
+        tags = fault["ctx"]["expected_tags"].replace("'", "")
+        which = f"{key}.{fault['ctx']['discriminator'].strip(chr(39))}".lstrip(".")
+        tag = _cut(str(fault["ctx"]["tag"]))
+        return f"{which}: {tag!r} is none of {tags}{nearest(tag, tags.split(', '))}"
     message = _cut(fault["msg"].removeprefix("Value error, "), 5 * _WIDEST)
     # of a whole section that does not fit together, the message names the keys
     given = "" if isinstance(fault["input"], dict) else f" (given: {shown(fault['input'])})"

@@ -148,7 +148,8 @@ def recipe_faults(
     except ValidationError as error:
         listed: set[str] | None = set() if error.title == model.__name__ else None
         faults = faults_text(error, lambda fault: _describe(fault, listed, model))
-        raise RecipeError(f"recipe {where}: {faults}. All keys: {keys}") from error
+        end = "" if faults.endswith("?") else "."
+        raise RecipeError(f"recipe {where}: {faults}{end} All keys: {keys}") from error
 
 
 def save_recipe(recipe: BaseModel, path: Path) -> None:

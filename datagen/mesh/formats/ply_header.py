@@ -14,6 +14,7 @@ _KINDS = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_CUT_OFF = "it ends before its {:,} elements {!r} do: export or copy it again"
 _HEADER = 2**20  # bytes in which a header must end
 
 
@@ -110,7 +111,7 @@ def read_tables(content: bytes, header: Header, rows: list[bytes]) -> dict[str, 
 def _text_table(element: Element, rows: list[bytes], at: int) -> ElementValues:
     end = at + element.count
     if end > len(rows):
-        raise ValueError(f"it ends before its {element.count:,} elements {element.name!r} do")
+        raise ValueError(_CUT_OFF.format(element.count, element.name))
     words = [row.split() for row in rows[at:end]]
     if any(each.counted for each in element.properties):
         return _text_lists(element, words, at)
@@ -150,11 +151,17 @@ def _table(
 def _binary_table(content: bytes, element: Element, order: str, at: int) -> ElementValues:
     if not any(each.counted for each in element.properties):
         kind = np.dtype([(each.name, order + each.kind) for each in element.properties])
+        _check_end(content, element, at + element.count * kind.itemsize)
         values = np.frombuffer(content, kind, element.count, at) if element.count else np.empty(0, kind)
         return ElementValues(
             {name: values[name] for name in kind.names or ()}, {}, at, at + element.count * kind.itemsize
         )
     return _equal_lists(content, element, order, at) or _lists(content, element, order, at)
+
+
+def _check_end(content: bytes, element: Element, end: int) -> None:
+    if end > len(content):
+        raise ValueError(_CUT_OFF.format(element.count, element.name))
 
 
 def _equal_lists(content: bytes, element: Element, order: str, at: int) -> ElementValues | None:
@@ -165,6 +172,7 @@ def _equal_lists(content: bytes, element: Element, order: str, at: int) -> Eleme
     for each in element.properties:
         before = np.dtype(fields).itemsize
         if each.counted:
+            _check_end(content, element, at + before + np.dtype(each.counted).itemsize)
             size = int(np.frombuffer(content, order + each.counted, 1, at + before)[0])
             fields += [(each.name + "#", order + each.counted), (each.name, order + each.kind, (max(size, 0),))]
         else:
@@ -192,10 +200,12 @@ def _lists(content: bytes, element: Element, order: str, at: int) -> ElementValu
         for each, counter, kind in kinds:
             size = 1
             if each.counted:
+                _check_end(content, element, place + counter.itemsize)
                 size = int(np.frombuffer(content, counter, 1, place)[0])
                 if size < 0:  # NumPy takes it for: all that is left
                     raise ValueError(f"a list of {element.name!r} has {size} values")
                 place += counter.itemsize
+            _check_end(content, element, place + size * kind.itemsize)
             found[each.name].append(np.frombuffer(content, kind, size, place))
             place += size * kind.itemsize
     flat = {

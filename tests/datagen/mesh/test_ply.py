@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from datagen.common.errors import MeshError
 from datagen.mesh.files import read_mesh_file, write_posed
 from tests.support.shapes.mesh_files import GOLDEN, PNG, golden
 
@@ -34,6 +35,18 @@ def test_all_but_positions_and_normals_of_a_ply_file_stays(tmp_path: Path, name:
     else:
         assert len(written) == len(content) and written[-20:] == content[-20:]
         assert written[: len(content) - 5 * 57 - 60] == content[: len(content) - 5 * 57 - 60]
+
+
+@pytest.mark.parametrize("name", ["rich.ply", "rich-little.ply", "rich-big.ply"])
+def test_a_ply_file_that_is_cut_off_says_so_wherever_it_ends(tmp_path: Path, name: str) -> None:
+    content = golden(name, tmp_path).read_bytes()
+    after_header = content.find(b"end_header") + len(b"end_header\n")
+    ends = range(after_header, len(content.rstrip()) - 60, 7)  # an element of another kind is last
+    for end in ends:
+        (tmp_path / "cut.ply").write_bytes(content[:end])
+        with pytest.raises(MeshError, match=r"(it ends before its|fewer than|shorter than)"):
+            read_mesh_file(tmp_path / "cut.ply")
+    assert len(ends) > 10
 
 
 def test_normals_of_a_ply_file_follow_the_pose(tmp_path: Path) -> None:
