@@ -1,6 +1,7 @@
 """The poses of meshes, read off them by the parts network: rotations of joints, by which other bodies can be posed."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from datagen.common.arrays import Floats
 from datagen.common.errors import CheckpointError, MeshError
 from datagen.mesh.geometry import InFaces, Mesh
 from training.inference.predict import load_trained
-from training.inference.standing import MISREAD, facing, sampled, standing, understanding_of
+from training.inference.standing import MISREAD, facing, rest_error, sampled, standing, understanding_of
 from training.networks.parts import Parts
 
 
@@ -28,11 +29,12 @@ class PosesRead(NamedTuple):
     rotations: NDArray[np.float64]
 
 
-def read_poses(weights: Path, meshes: Iterable[Mesh]) -> PosesRead:
+def read_poses(weights: Sequence[Path], meshes: Iterable[Mesh]) -> PosesRead:
     """The pose of each mesh, over the joints that the network of ``weights`` tells apart.
 
-    How the first one stands is found, and which way each faces and leans. The root's place is not read: a body posed so
-    stays where it stands.
+    Of several weights those are taken that read the first mesh best (`training.inference.standing.rest_error`). How it
+    stands is found, and which way each faces and leans. The root's place is not read: a body posed so stays where it
+    stands.
 
     Raises
     ------
@@ -41,11 +43,12 @@ def read_poses(weights: Path, meshes: Iterable[Mesh]) -> PosesRead:
     MeshError
         A mesh cannot be used, or is no body that the network knows.
     """
-    network = load_trained(weights)[0]
-    if not isinstance(network, Parts):
-        raise CheckpointError(f"{weights} holds no weights of network 'parts', which reads poses off meshes")
+    networks = [_reader(each) for each in weights]
+    frames = (InFaces.checked(mesh, name=f"mesh {number}").mesh for number, mesh in enumerate(meshes))
+    first = list(islice(frames, 1))
+    network = min(networks, key=lambda each: sum(_misread(each, mesh) for mesh in first))
     parents = [-1 if parent == part else parent for part, parent in enumerate(network.parents.tolist())]
-    world = np.stack(list(_world_rotations(network, meshes)))
+    world = np.stack(list(_world_rotations(network, chain(first, frames))))
     return PosesRead(network.joints, tuple(parents), local_rotations(world, parents))
 
 
@@ -60,12 +63,23 @@ def local_rotations(world: Floats, parents: Iterable[int]) -> NDArray[np.float64
     return Rotation.from_matrix(found.reshape(-1, 3, 3)).as_rotvec().reshape(*found.shape[:2], 3)
 
 
+def _reader(weights: Path) -> Parts:
+    network = load_trained(weights)[0]
+    if not isinstance(network, Parts):
+        raise CheckpointError(f"{weights} holds no weights of network 'parts', which reads poses off meshes")
+    return network
+
+
+def _misread(network: Parts, mesh: Mesh) -> float:
+    upright = standing(understanding_of(network), mesh.vertices).upright(mesh.vertices)
+    return rest_error(network, Mesh(upright, mesh.faces))
+
+
 @torch.no_grad()
 def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray[np.float64]]:
     """Rotations [part, 3, 3] of each mesh, Y up, facing +Z at rest."""
     understand, axes, turn = understanding_of(network), None, np.eye(3)
-    for number, each in enumerate(meshes):
-        mesh = InFaces.checked(each, name=f"mesh {number}").mesh
+    for number, mesh in enumerate(meshes):
         if axes is None:  # the others may turn round and bend
             axes = standing(understand, mesh.vertices)
             turn = axes.lean

@@ -34,7 +34,8 @@ _DEFAULTS: dict[str, Any] = {"up": "Y", "front": "", "align": False, "refine": 0
 class PoseTransferModel(PythonModel):  # type: ignore[misc]
     """Source vertices [n, 3], target vertices [m, 3] and target faces [f, 3] in; posed vertices [m, 3] out.
 
-    Unwrapped, it takes the source's faces, too (``source_faces``), which the parts network makes use of.
+    The source may be points. Unwrapped, it takes the source's faces, too (``source_faces``), which the parts network
+    makes use of, and the names of files.
 
     ``params`` are options of ``dsffnet transfer``: ``up`` and ``front`` (of both meshes, or ``source,target``),
     ``align`` (each mesh's axes are found) and ``refine`` (weight of the target's edges; 0, the default, for none).
@@ -50,8 +51,7 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         if unknown:
             raise RecipeError(f"{unknown[0]!r} is no option of a transfer; there are {', '.join(_DEFAULTS)}")
         wanted = {**_DEFAULTS, **(params or {})}
-        target = _mesh(model_input, "target")
-        source = _source(model_input)
+        target, source = _mesh(model_input, "target"), _mesh(model_input, "source", points=True)
         of_source, of_target = self._axes(source, target, wanted)
         posed = self._transfer(
             source=source,
@@ -76,21 +76,15 @@ class PoseTransferModel(PythonModel):  # type: ignore[misc]
         return way.axes
 
 
-def _mesh(model_input: Any, role: str) -> Mesh:
+def _mesh(model_input: Any, role: str, *, points: bool = False) -> Mesh:
+    """The mesh of a role; ``points``: no faces are asked of it."""
     given = model_input[role]
     if isinstance(given, str | Path):
-        return read_mesh_file(given).mesh
-    if f"{role}_faces" not in model_input:
+        return read_mesh_file(given, points=points).mesh
+    if f"{role}_faces" not in model_input and not points:
         raise MeshError(f"{role}_faces is missing: triangles [f, 3] go with the vertices of {role}")
-    mesh = Mesh(np.asarray(given, np.float64), np.asarray(model_input[f"{role}_faces"], np.int64))
-    return check_mesh(mesh, name=role)
-
-
-def _source(model_input: Any) -> Mesh:
-    """The source; of a pose no faces are asked, so that one that joins nothing stands for them where none are given."""
-    if isinstance(model_input["source"], str | Path) or "source_faces" in model_input:
-        return _mesh(model_input, "source")
-    return _mesh({**model_input, "source_faces": np.zeros((1, 3), np.int64)}, "source")
+    faces = np.asarray(model_input.get(f"{role}_faces", np.empty((0, 3))), np.int64)
+    return check_mesh(Mesh(np.asarray(given, np.float64), faces), name=role, points=points)
 
 
 def download_weights(uri: str, tracking_uri: str, folder: Path, *, own: bool = False) -> Path:

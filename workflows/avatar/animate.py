@@ -94,7 +94,8 @@ def animate(
 def poses_of(folder: AvatarFolder, file: Path | None, source: Path | None = None, *, count: int, seed: int) -> Poses:
     """The poses of a file, or those that people are in, or a walk through random ones that the avatar learned from.
 
-    ``source``: a mesh, a folder or a pattern of frames; poses are read off them by the weights ``human``.
+    ``source``: a mesh, a folder or a pattern of frames; poses are read off them by the weights ``human`` or
+    ``dressed``, whichever read the first one best.
 
     Raises
     ------
@@ -111,7 +112,7 @@ def poses_of(folder: AvatarFolder, file: Path | None, source: Path | None = None
     if source:
         files = [source] if source.is_file() else frames_of(source)
         meshes = (read_mesh_file(each).mesh for each in bar(files, total=len(files), what="read poses", unit="mesh"))
-        return Poses(*read_poses(own_weights("human"), meshes))
+        return Poses(*read_poses([own_weights("human"), own_weights("dressed")], meshes))
     data = load_avatar(str(folder.recipe)).data
     recipe = data.poses if data else PoseRecipe()
     drawn = draw_poses(PoseRecipe(distribution=recipe.distribution, seed=recipe.seed + 1 + seed), range(count))

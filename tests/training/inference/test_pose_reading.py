@@ -30,7 +30,7 @@ def test_the_pose_of_a_person_is_read() -> None:
     body, poses = load_body(AnnyBody(topology="notoes_collapse5pc")), draw_poses(PoseRecipe(seed=7), range(4))
     who = body.draw_identity(generator(7, Stream.IDENTITY, 0), 0)
     meshes = [Mesh(each, body.faces(who)) for each in body.vertices(who, poses)]
-    found = Poses(*read_poses(own_weights("human"), meshes))
+    found = Poses(*read_poses([own_weights("human")], meshes))
     assert set(found.joints) == set(poses.joints) and len(found) == 4
     order = [found.joints.index(name) for name in poses.joints]
     away = degrees_between(poses, Poses(poses.joints, poses.parents, found.rotations[:, order]))
@@ -41,11 +41,14 @@ def test_the_pose_of_a_person_is_read() -> None:
     )
     assert posed < 0.03 and posed < 0.2 * still
 
+    either = Poses(*read_poses([own_weights("animals"), own_weights("human")], meshes[:1]))
+    assert either.joints == found.joints and np.array_equal(either.rotations, found.rotations[:1]), "who reads it best"
+
     quarter = Rotation.from_euler("y", 90, degrees=True)
-    (turned,) = read_poses(own_weights("human"), [Mesh(quarter.apply(meshes[1].vertices), meshes[1].faces)]).rotations
+    (turned,) = read_poses([own_weights("human")], [Mesh(quarter.apply(meshes[1].vertices), meshes[1].faces)]).rotations
     assert np.degrees((Rotation.from_rotvec(turned[0])).magnitude()) < 30, "people are read as they face"
     loose = Mesh(np.concatenate([meshes[1].vertices, [[0, 8, 0]]]), meshes[1].faces)
-    (same,) = read_poses(own_weights("human"), [loose]).rotations
+    (same,) = read_poses([own_weights("human")], [loose]).rotations
     assert (
         np.array_equal(same, found.rotations[1])
         or degrees_between(
@@ -58,6 +61,6 @@ def test_the_pose_of_a_person_is_read() -> None:
 def test_what_is_no_person_and_weights_that_read_no_poses_are_refused() -> None:
     ball = trimesh.creation.icosphere(3)
     with pytest.raises(MeshError, match="mesh 0 is no body whose pose these weights know"):
-        read_poses(own_weights("human"), [Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))])
+        read_poses([own_weights("human")], [Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))])
     with pytest.raises(CheckpointError, match="holds no weights of network 'parts'"):
-        read_poses(own_weights("dsffnet-people"), [])
+        read_poses([own_weights("human"), own_weights("dsffnet-people")], [])

@@ -58,6 +58,14 @@ def test_arrays_and_files_give_what_the_command_gives(
     assert np.allclose(model.predict(None, files(folder)), expected, atol=1e-6)
 
 
+def test_a_source_of_points_is_what_it_is_without_faces(
+    model: PoseTransferModel, folder: Path, arrays: dict[str, Any]
+) -> None:
+    (folder / "points.obj").write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in arrays["source"].tolist()))
+    of_file = model.predict(None, files(folder) | {"source": str(folder / "points.obj")})
+    assert np.array_equal(of_file, model.predict(None, arrays))
+
+
 def test_refining_and_axes_are_those_of_the_command(
     model: PoseTransferModel, folder: Path, arrays: dict[str, Any]
 ) -> None:
