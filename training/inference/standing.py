@@ -40,10 +40,9 @@ def understanding_of(network: Parts) -> Understanding:
     return understand
 
 
-MISREAD = 9.0
+MISREAD = 7.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
-animals that were read rightly by weights of their kind have less; all else has more but for a table or an animal by
-weights of people, and people on all fours by those of animals (docs/results/transfer.md)."""
+animals that were read rightly by weights of their kind have less, things have more (docs/results/transfer.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands; bare people have 0.0013 at most
 (docs/results/transfer.md)."""
