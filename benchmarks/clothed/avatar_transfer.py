@@ -51,7 +51,7 @@ def compare(folder: AvatarFolder, frames: int) -> Iterator[tuple[str, int, dict[
         its = subject.unseen[:frames]
         sources = _sources(Poses(joints, parents, subject.rotations[its].astype(np.float64)))
         resting, *posed = sources
-        read = Poses(*read_poses(own_weights("human"), [resting, *posed]))[1:]
+        read = Poses(*read_poses([own_weights("human")], [resting, *posed]))[1:]
         driven = posed_by(subject.body, read.rotations, read.joints, read.parents)
         by_read = list(wardrobe.animated(network, number, driven))
         by_truth = list(wardrobe.posed(network, [(number, frame) for frame in its]))

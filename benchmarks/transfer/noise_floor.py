@@ -1,4 +1,4 @@
-"""What noise in a source leaves at least: ``python -m benchmarks.transfer.noise_floor DATASET [--noise 0.02]``.
+"""What exact rigs lose by noise in a source: ``python -m benchmarks.transfer.noise_floor DATASET [--noise 0.02]``.
 
 No network: the dataset's own rig is fitted to the noisy source, that is, its body at rest, weights and joints are
 given, and the pose alone is sought by least squares, from the true one on. The target is posed by its own rig as found.
@@ -25,6 +25,7 @@ from training.inference.mesh_reading import normalised
 from training.objectives import PMD_UNIT
 
 _STEP = 1e-4  # radians and metres: rotations are rounded to 1e-6
+_LEAST_NOISE = 1e-6  # that residuals are counted in
 _LEAST_VARIANCE = 1e-4  # of a rotation's numbers, radians squared: joints that hardly turn may a little
 
 
@@ -76,7 +77,7 @@ def error(bodies: BodiesAtRest, case: Case, noise: float, spread: Spread | None)
     """PMD of a transfer whose source has noise, in `PMD_UNIT`."""
     source, target = (Body(bodies, identity) for identity in (case.triple[0], case.triple[2]))
     noisy = add_noise(case.source, noise, case.number).vertices
-    sigma = noise * float(bounding_box(case.source.vertices).half)
+    sigma = max(noise, _LEAST_NOISE) * float(bounding_box(case.source.vertices).half)
     true = bodies.dataset.rotations()[case.triple[1]].reshape(-1).astype(np.float64)
     shift = (case.source.vertices - source.posed(true[None])[0]).mean(axis=0)
 

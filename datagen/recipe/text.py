@@ -142,8 +142,11 @@ def fault_text(fault: Any, *, key: str | None = None) -> str:
     if fault["type"] == "union_tag_invalid":
         tags = fault["ctx"]["expected_tags"].replace("'", "")
         which = f"{key}.{fault['ctx']['discriminator'].strip(chr(39))}".lstrip(".")
-        tag = _cut(str(fault["ctx"]["tag"]))
-        return f"{which}: {tag!r} is none of {tags}{nearest(tag, tags.split(', '))}"
+        given = (
+            fault["input"].get(which.rpartition(".")[2]) if isinstance(fault["input"], dict) else fault["ctx"]["tag"]
+        )
+        near = nearest(given, tags.split(", ")) if isinstance(given, str) else ""
+        return f"{which}: {shown(given)} is none of {tags}{near}"
     message = _cut(fault["msg"].removeprefix("Value error, "), 5 * _WIDEST)
     # of a whole section that does not fit together, the message names the keys
     given = "" if isinstance(fault["input"], dict) else f" (given: {shown(fault['input'])})"

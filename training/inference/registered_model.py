@@ -83,7 +83,8 @@ def _mesh(model_input: Any, role: str, *, points: bool = False) -> Mesh:
         return read_mesh_file(given, points=points).mesh
     if f"{role}_faces" not in model_input and not points:
         raise MeshError(f"{role}_faces is missing: triangles [f, 3] go with the vertices of {role}")
-    faces = np.asarray(model_input.get(f"{role}_faces", np.empty((0, 3))), np.int64)
+    faces = np.asarray(model_input.get(f"{role}_faces", ()), np.int64)
+    faces = faces if faces.size else faces.reshape(0, 3)
     return check_mesh(Mesh(np.asarray(given, np.float64), faces), name=role, points=points)
 
 

@@ -52,9 +52,7 @@ class Header:
 
 def read_header(content: bytes) -> Header:
     """Return the header at the beginning of a file; ValueError where there is none."""
-    end = content[:_HEADER].find(b"end_header")
-    if not content.startswith(b"ply") or end < 0:
-        raise ValueError("it does not begin with a PLY header")
+    end, after = _ends(content)
     lines = [line.split() for line in content[:end].decode("utf-8", "replace").splitlines()]
     form, comments, elements = "", [], list[tuple[str, int, list[Property]]]()
     for words in lines:
@@ -72,8 +70,18 @@ def read_header(content: bytes) -> Header:
         raise ValueError("two elements have one name")
     if form not in ORDERS:
         raise ValueError(f"its format is {form!r}, none of {', '.join(ORDERS)}")
-    after = content.find(b"\n", end) + 1 or content.find(b"\r", end) + 1
     return Header(form, tuple(Element(name, n, tuple(each)) for name, n, each in elements), tuple(comments), after)
+
+
+def _ends(content: bytes) -> tuple[int, int]:
+    """Where the last line of the header begins, and what follows it."""
+    if not content.startswith(b"ply"):
+        raise ValueError("it does not begin with a PLY header")
+    end = content[:_HEADER].find(b"end_header")
+    after = (content.find(b"\n", end) + 1 or content.find(b"\r", end) + 1) if end >= 0 else 0
+    if not after:
+        raise ValueError("its header has no end: export or copy it again")
+    return end, after
 
 
 def _property(words: list[str]) -> Property:
@@ -174,6 +182,8 @@ def _equal_lists(content: bytes, element: Element, order: str, at: int) -> Eleme
         if each.counted:
             _check_end(content, element, at + before + np.dtype(each.counted).itemsize)
             size = int(np.frombuffer(content, order + each.counted, 1, at + before)[0])
+            first = at + before + np.dtype(each.counted).itemsize
+            _check_end(content, element, first + max(size, 0) * np.dtype(each.kind).itemsize)
             fields += [(each.name + "#", order + each.counted), (each.name, order + each.kind, (max(size, 0),))]
         else:
             fields.append((each.name, order + each.kind))

@@ -40,13 +40,10 @@ def test_all_but_positions_and_normals_of_a_ply_file_stays(tmp_path: Path, name:
 @pytest.mark.parametrize("name", ["rich.ply", "rich-little.ply", "rich-big.ply"])
 def test_a_ply_file_that_is_cut_off_says_so_wherever_it_ends(tmp_path: Path, name: str) -> None:
     content = golden(name, tmp_path).read_bytes()
-    after_header = content.find(b"end_header") + len(b"end_header\n")
-    ends = range(after_header, len(content.rstrip()) - 60, 7)  # an element of another kind is last
-    for end in ends:
+    for end in range(3, len(content.rstrip()) - 2):  # a number of a text may lose its last letter
         (tmp_path / "cut.ply").write_bytes(content[:end])
-        with pytest.raises(MeshError, match=r"(it ends before its|fewer than|shorter than)"):
+        with pytest.raises(MeshError, match=r"(ends before its|has no end|fewer than|shorter than|to its end)"):
             read_mesh_file(tmp_path / "cut.ply")
-    assert len(ends) > 10
 
 
 def test_normals_of_a_ply_file_follow_the_pose(tmp_path: Path) -> None:

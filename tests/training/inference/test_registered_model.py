@@ -9,15 +9,20 @@ import mlflow
 import numpy as np
 import pytest
 
+from datagen.bodies import load_body
 from datagen.common.errors import MeshError, RecipeError, RegistryError
+from datagen.common.seeding import Stream, generator
 from datagen.generate import generate
 from datagen.mesh.files import read_mesh_file, save_mesh
 from datagen.mesh.geometry import Mesh
+from datagen.poses import draw_poses
+from datagen.recipe import AnnyBody, PoseRecipe
 from tests.support.recipes import tiny_dataset
 from tests.support.workflows import untrained_run
 from training.inference.orientation import EVERY_AXES, Axes, Orientation
 from training.inference.registered_model import PoseTransferModel, download_weights
 from training.inference.transfer import PoseTransfer
+from workflows.pretrained import own_weights
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +69,22 @@ def test_a_source_of_points_is_what_it_is_without_faces(
     (folder / "points.obj").write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in arrays["source"].tolist()))
     of_file = model.predict(None, files(folder) | {"source": str(folder / "points.obj")})
     assert np.array_equal(of_file, model.predict(None, arrays))
+
+
+def test_the_parts_network_reads_a_source_without_faces_as_points() -> None:
+    body = load_body(AnnyBody(topology="notoes_collapse5pc"))
+    who = body.draw_identity(generator(7, Stream.IDENTITY, 0), 0)
+    source, target = body.vertices(who, draw_poses(PoseRecipe(seed=7), range(2)))
+    made = PoseTransferModel()
+    made.load_context(SimpleNamespace(artifacts={"weights": str(own_weights("human"))}))
+    given = {"source": source, "target": target, "target_faces": body.faces(who)}
+    found = made.predict(None, given)
+    whole = Mesh(target, body.faces(who))
+    transfer, no_faces = PoseTransfer.from_run(own_weights("human")), np.empty((0, 3), np.int64)
+    of_points = transfer(source=Mesh(source, no_faces), target=whole).vertices
+    of_mesh = transfer(source=Mesh(source, body.faces(who)), target=whole).vertices
+    assert np.allclose(found, of_points, atol=1e-6) and not np.allclose(found, of_mesh, atol=1e-6)
+    assert np.array_equal(found, made.predict(None, given | {"source_faces": []}))
 
 
 def test_refining_and_axes_are_those_of_the_command(

@@ -224,7 +224,7 @@ def test_words_are_explained_where_they_are_said(session: Session, view: Seen, l
     assert outcome is not None
     outcome.warnings = []
     assert "misread" not in about(outcome, session.folder)
-    outcome.warnings = ["leg.obj is unlike the bodies of training (misread by 20 degrees, more than 9)"]
+    outcome.warnings = ["leg.obj is unlike the bodies of training (misread by 20 degrees, more than 7)"]
     assert "*misread*: the weights say how each part of a mesh is turned" in about(outcome, session.folder)
     assert not legend(outcome, outcome.frames[0], 1.0, shown=False)
     known = replace(outcome.frames[0], pmd=1e-4)
