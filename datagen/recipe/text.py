@@ -140,17 +140,19 @@ def fault_text(fault: Any, *, key: str | None = None) -> str:
     """Return one fault in words: the key, what is wrong, and the value that was given."""
     key = _cut(".".join(map(str, fault["loc"]))) if key is None else key
     if fault["type"] == "union_tag_invalid":
-        tags = fault["ctx"]["expected_tags"].replace("'", "")
-        which = f"{key}.{fault['ctx']['discriminator'].strip(chr(39))}".lstrip(".")
-        given = (
-            fault["input"].get(which.rpartition(".")[2]) if isinstance(fault["input"], dict) else fault["ctx"]["tag"]
-        )
-        near = nearest(given, tags.split(", ")) if isinstance(given, str) else ""
-        return f"{which}: {shown(given)} is none of {tags}{near}"
+        return _unknown_kind(fault, key)
     message = _cut(fault["msg"].removeprefix("Value error, "), 5 * _WIDEST)
     # of a whole section that does not fit together, the message names the keys
     given = "" if isinstance(fault["input"], dict) else f" (given: {shown(fault['input'])})"
     return f"{key}: {message}{given}" if key else f"{message}{given}"
+
+
+def _unknown_kind(fault: Any, section: str) -> str:
+    """That a section (a body, a network, poses) is of a kind that there is not; the key that names it is said."""
+    name, known = (fault["ctx"][each].replace("'", "") for each in ("discriminator", "expected_tags"))
+    given = fault["input"].get(name) if isinstance(fault["input"], dict) else fault["ctx"]["tag"]
+    near = nearest(given, known.split(", ")) if isinstance(given, str) else ""
+    return f"{'.'.join(filter(None, (section, name)))}: {shown(given)} is none of {known}{near}"
 
 
 def shown(value: Any) -> str:

@@ -45,7 +45,7 @@ def read_poses(weights: Sequence[Path], meshes: Iterable[Mesh]) -> PosesRead:
     """
     networks = [_reader(each) for each in weights]
     frames = (InFaces.checked(mesh, name=f"mesh {number}").mesh for number, mesh in enumerate(meshes))
-    first = list(islice(frames, 1))
+    first = list(islice(frames, 1 if len(networks) > 1 else 0))
     network = min(networks, key=lambda each: sum(_misread(each, mesh) for mesh in first))
     parents = [-1 if parent == part else parent for part, parent in enumerate(network.parents.tolist())]
     world = np.stack(list(_world_rotations(network, chain(first, frames))))
@@ -64,6 +64,7 @@ def local_rotations(world: Floats, parents: Iterable[int]) -> NDArray[np.float64
 
 
 def _reader(weights: Path) -> Parts:
+    """The network of some weights."""
     network = load_trained(weights)[0]
     if not isinstance(network, Parts):
         raise CheckpointError(f"{weights} holds no weights of network 'parts', which reads poses off meshes")
@@ -71,6 +72,7 @@ def _reader(weights: Path) -> Parts:
 
 
 def _misread(network: Parts, mesh: Mesh) -> float:
+    """The rest error of a mesh as it is found to stand, in degrees."""
     upright = standing(understanding_of(network), mesh.vertices).upright(mesh.vertices)
     return rest_error(network, Mesh(upright, mesh.faces))
 

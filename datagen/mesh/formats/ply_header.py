@@ -168,6 +168,7 @@ def _binary_table(content: bytes, element: Element, order: str, at: int) -> Elem
 
 
 def _check_end(content: bytes, element: Element, end: int) -> None:
+    """ValueError where a file ends before what is read of an element does."""
     if end > len(content):
         raise ValueError(_CUT_OFF.format(element.count, element.name))
 
@@ -180,9 +181,9 @@ def _equal_lists(content: bytes, element: Element, order: str, at: int) -> Eleme
     for each in element.properties:
         before = np.dtype(fields).itemsize
         if each.counted:
-            _check_end(content, element, at + before + np.dtype(each.counted).itemsize)
-            size = int(np.frombuffer(content, order + each.counted, 1, at + before)[0])
             first = at + before + np.dtype(each.counted).itemsize
+            _check_end(content, element, first)
+            size = int(np.frombuffer(content, order + each.counted, 1, at + before)[0])
             _check_end(content, element, first + max(size, 0) * np.dtype(each.kind).itemsize)
             fields += [(each.name + "#", order + each.counted), (each.name, order + each.kind, (max(size, 0),))]
         else:

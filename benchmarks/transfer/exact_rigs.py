@@ -1,9 +1,9 @@
-"""What exact rigs lose by noise in a source: ``python -m benchmarks.transfer.noise_floor DATASET [--noise 0.02]``.
+"""What exact rigs lose by noise: ``python -m benchmarks.transfer.exact_rigs DATASET [--noise 0.02]``.
 
 No network: the dataset's own rig is fitted to the noisy source, that is, its body at rest, weights and joints are
 given, and the pose alone is sought by least squares, from the true one on. The target is posed by its own rig as found.
-*Vertices alone* asks nothing else of the pose; with *the poses' spread* a pose counts as less likely the further it is
-from the seen poses' mean, by their covariance. PMD, means and medians; half a minute for 60 triples of 615 vertices.
+*Vertices alone* asks nothing else of the pose; with *the spread of the seen poses* a pose counts as less likely the
+further it is from their mean, by their covariance. PMD, means, medians in brackets; half a minute for 60 triples.
 """
 
 from __future__ import annotations
