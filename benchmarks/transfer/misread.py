@@ -72,7 +72,7 @@ def row(transfer: PoseTransfer, name: str, meshes: list[Mesh]) -> Found:
 
 def reading(transfer: PoseTransfer, mesh: Mesh) -> tuple[float, float]:
     """Misfit and rest error of a mesh as it is found to stand."""
-    found = transfer.standing(mesh.vertices)
+    found = transfer.standing(mesh)
     assert isinstance(found, Standing)
     return found.misfit, transfer.rest_error(Mesh(found.upright(mesh.vertices), mesh.faces))
 

@@ -72,6 +72,7 @@ class PoseSource(Protocol):
 
 SOURCES = {
     "npt": "datagen.poses.joint_ranges:NptSource",
+    "anatomical": "datagen.poses.range_of_motion:AnatomicalSource",
     "ranges": "datagen.poses.joint_ranges:RangeSource",
     "found": "datagen.poses.pose_files:FoundSource",
     "clips": "datagen.poses.animation_clips:ClipSource",

@@ -82,7 +82,12 @@ class NptSource:
 
     def draw(self, pose: int) -> NDArray[np.float64]:
         """Axis-angle [24, 3] in radians."""
-        return _draw(NPT_FAMILIES[self.family_of(pose)], JOINTS, generator(self._seed, Stream.POSE, pose))
+        return npt_pose(self.family_of(pose), generator(self._seed, Stream.POSE, pose))
+
+
+def npt_pose(family: str, random: np.random.Generator) -> NDArray[np.float64]:
+    """Axis-angle [24, 3] in radians, by chance, of one of :data:`NPT_FAMILIES`."""
+    return _draw(NPT_FAMILIES[family], JOINTS, random)
 
 
 class RangeSource:

@@ -25,7 +25,16 @@ from datagen.recipe.dataset import (
     StoreRecipe,
     plain_sha256,
 )
-from datagen.recipe.poses import AmassPoses, ClipPoses, Distribution, FilePoses, FoundPoses, NptPoses, RangePoses
+from datagen.recipe.poses import (
+    AmassPoses,
+    AnatomicalPoses,
+    ClipPoses,
+    Distribution,
+    FilePoses,
+    FoundPoses,
+    NptPoses,
+    RangePoses,
+)
 
 __all__ = [
     "ANIMALS",
@@ -33,6 +42,7 @@ __all__ = [
     "PART_KINDS",
     "PATH_KEYS",
     "AmassPoses",
+    "AnatomicalPoses",
     "AnnyBody",
     "AnnyRig",
     "AnnyTopology",

@@ -18,6 +18,13 @@ class NptPoses(Frozen):
     )
 
 
+class AnatomicalPoses(Frozen):
+    """People's whole range of motion: bent trunks, turned heads, raised and folded arms, deep squats."""
+
+    name: Literal["anatomical"] = "anatomical"
+    npt: float = Field(0.0, ge=0, le=1, description="share of the poses, by chance, that are drawn as npt's are")
+
+
 class RangePoses(Frozen):
     """Uniform joint ranges of one's own, over any joint names."""
 
@@ -79,5 +86,6 @@ class FoundPoses(Frozen):
 
 
 Distribution = Annotated[
-    NptPoses | RangePoses | ClipPoses | AmassPoses | FilePoses | FoundPoses, Field(discriminator="name")
+    NptPoses | AnatomicalPoses | RangePoses | ClipPoses | AmassPoses | FilePoses | FoundPoses,
+    Field(discriminator="name"),
 ]

@@ -14,7 +14,7 @@ from datagen.common.arrays import Floats
 from datagen.common.errors import CheckpointError, MeshError
 from datagen.mesh.geometry import InFaces, Mesh
 from training.inference.predict import load_trained
-from training.inference.standing import MISREAD, facing, rest_error, sampled, standing, understanding_of
+from training.inference.standing import MISREAD, facing, rest_error, sampled, stands, understanding_of
 from training.networks.parts import Parts
 
 
@@ -73,8 +73,10 @@ def _reader(weights: Path) -> Parts:
 
 def _misread(network: Parts, mesh: Mesh) -> float:
     """The rest error of a mesh as it is found to stand, in degrees."""
-    upright = standing(understanding_of(network), mesh.vertices).upright(mesh.vertices)
-    return rest_error(network, Mesh(upright, mesh.faces))
+    found = stands(network, mesh)
+    if not np.isnan(found.rest_error):
+        return found.rest_error
+    return rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
 
 
 @torch.no_grad()
@@ -83,7 +85,7 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
     understand, axes, turn = understanding_of(network), None, np.eye(3)
     for number, mesh in enumerate(meshes):
         if axes is None:  # the others may turn round and bend
-            axes = standing(understand, mesh.vertices)
+            axes = stands(network, mesh)
             turn = axes.lean
         upright = axes.turned(mesh.vertices)
         turn = facing(understand, upright, turn)

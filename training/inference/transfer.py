@@ -31,7 +31,7 @@ from training.inference.mesh_reading import (
 from training.inference.orientation import UPRIGHT, Axes
 from training.inference.predict import load_trained
 from training.inference.projection import OntoParts
-from training.inference.standing import Standing, facing, misfit, rest_error, standing, understanding_of
+from training.inference.standing import Standing, facing, misfit, rest_error, stands, understanding_of
 from training.networks.execution import GraphedTransfer, products
 from training.networks.layers.surface import Surface
 from training.networks.parts import Parts
@@ -152,7 +152,7 @@ class PoseTransfer:
         """
         whole, seen = target, InFaces.checked(target, name="target")
         target = seen.mesh
-        target_axes = _as_told(target_axes) or self.standing(target.vertices)
+        target_axes = _as_told(target_axes) or self.standing(target)
         upright = Mesh(target_axes.turned(target.vertices), target.faces)
         frames = self._frames(sources, _as_told(source_axes), upright, target_axes)
         if smooth:
@@ -220,9 +220,9 @@ class PoseTransfer:
         """Whether the network says how well it understands a mesh, so that meshes are turned without being asked."""
         return isinstance(self._network, Parts)
 
-    def standing(self, vertices: Floats) -> Axes | Standing:
-        """How a mesh [n, 3] stands, where the network can say; else as the training data."""
-        return standing(understanding_of(self._network), vertices) if isinstance(self._network, Parts) else UPRIGHT
+    def standing(self, mesh: Mesh) -> Axes | Standing:
+        """How a mesh stands, where the network can say; else as the training data."""
+        return stands(self._network, mesh) if isinstance(self._network, Parts) else UPRIGHT
 
     def misfit(self, vertices: Floats) -> float:
         """How badly the parts network, or that which projects, understands a mesh [n, 3] that stands upright."""
@@ -252,7 +252,7 @@ class PoseTransfer:
         for number, source in enumerate(sources):
             mesh = InFaces.checked(source, name=f"source {number}", points=True).mesh
             if number == 0:  # the others may turn round and bend
-                axes = axes or self.standing(mesh.vertices)
+                axes = axes or self.standing(mesh)
             assert axes is not None
             vertices = axes.turned(mesh.vertices)
             turn = self._turned_round(vertices, turn if number else axes)

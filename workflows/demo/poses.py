@@ -19,7 +19,7 @@ from datagen.poses import JOINTS, PARENTS, Poses, draw_poses
 from datagen.poses.amass import smpl_pose
 from datagen.poses.amass_files import find_motions, read_frames
 from datagen.poses.pose_files import read_pose_file
-from datagen.recipe import ClipPoses, NptPoses, PoseRecipe
+from datagen.recipe import AnatomicalPoses, ClipPoses, PoseRecipe
 from training.viz.style import short
 
 PERSON, ANIMAL = "person", "animal"
@@ -39,7 +39,7 @@ _ABOUT_LIMIT = 100_000  # bytes
 _SEED = 20_000  # no recipe of the project draws from it
 _WALK, _STEPS = 3, 12  # random poses of a walk, and frames from one to the next
 _FRAMES, _FRAMES_PER_SECOND = 60, 15  # of a file that is played
-_DISTRIBUTIONS = {PERSON: NptPoses(), ANIMAL: ClipPoses(path="animals", jitter=0)}
+_DISTRIBUTIONS = {PERSON: AnatomicalPoses(), ANIMAL: ClipPoses(path="animals", jitter=0)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,20 +126,27 @@ class _Remembering(PoseTransfer):
         self._found = lru_cache(maxsize=32)(self._find)
         self._errors = lru_cache(maxsize=32)(self._error)
 
-    def standing(self, vertices: Floats) -> Axes | Standing:
+    def standing(self, mesh: Mesh) -> Axes | Standing:
         """As found the first time."""
-        return self._found(vertices.astype(np.float64).tobytes())
+        return self._found(*_bytes(mesh))
 
     def rest_error(self, mesh: Mesh) -> float:
         """As found the first time."""
-        return self._errors(mesh.vertices.astype(np.float64).tobytes(), mesh.faces.astype(np.int64).tobytes())
+        return self._errors(*_bytes(mesh))
 
-    def _error(self, vertices: bytes, faces: bytes) -> float:
-        mesh = Mesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3))
-        return super().rest_error(mesh)
+    def _error(self, *mesh: bytes) -> float:
+        return super().rest_error(_mesh(*mesh))
 
-    def _find(self, vertices: bytes) -> Axes | Standing:
-        return super().standing(np.frombuffer(vertices).reshape(-1, 3))
+    def _find(self, *mesh: bytes) -> Axes | Standing:
+        return super().standing(_mesh(*mesh))
+
+
+def _bytes(mesh: Mesh) -> tuple[bytes, bytes]:
+    return mesh.vertices.astype(np.float64).tobytes(), mesh.faces.astype(np.int64).tobytes()
+
+
+def _mesh(vertices: bytes, faces: bytes) -> Mesh:
+    return Mesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3))
 
 
 class Transfers:

@@ -27,7 +27,7 @@ from training.tracking.provenance import provenance_of
 from workflows.studies.sizes import Other, Sizes
 
 _CLIPS = ("attack*", "eating*", "gallop*", "idle*", "jump*", "walk*")  # all but dying, where animals lie
-_OF_HUMANS = ("npt", "ranges", "amass")  # poses over SMPL's joints, which all human bodies here take
+_OF_HUMANS = ("npt", "anatomical", "ranges", "amass")  # poses over SMPL's joints, which all human bodies here take
 
 
 def own_recipe(home: Path) -> DatasetRecipe | None:

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
 from training.inference.domain_check import POOR, Tears
@@ -79,9 +81,11 @@ def _standing(transfer: PoseTransfer, mesh: Mesh, axes: Axes | None) -> Standing
     if axes:
         found = Standing(axes.matrix, transfer.misfit(axes.turned(mesh.vertices)))
     else:
-        stands = transfer.standing(mesh.vertices)
+        stands = transfer.standing(mesh)
         assert isinstance(stands, Standing)
         found = stands
+    if not np.isnan(found.rest_error):
+        return found
     return replace(found, rest_error=transfer.rest_error(Mesh(found.upright(mesh.vertices), mesh.faces)))
 
 

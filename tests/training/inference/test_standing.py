@@ -7,7 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from training.inference.standing import facing, misfit, standing
+from datagen.mesh.geometry import Mesh
+from tests.support.three_networks import lively
+from training.inference import standing as module
+from training.inference.standing import Standing, facing, misfit, standing
 
 RANDOM = np.random.default_rng(3)
 BODY = RANDOM.normal(size=(60, 3)) * (0.3, 1, 0.2)
@@ -248,3 +251,17 @@ def test_a_body_that_turns_round_is_followed_from_frame_to_frame() -> None:
         turn = facing(understand, frame.apply(BODY), turn)
         assert np.degrees((Rotation.from_matrix(turn).inv() * frame).magnitude()) < 7
         assert misfit(understand, frame.apply(BODY) @ turn) < 0.001
+
+
+@pytest.mark.parametrize(("as_it_is", "stays"), [(4.7, True), (20.0, False)])
+def test_another_way_is_not_taken_where_the_surface_says_that_it_is_misread(
+    monkeypatch: pytest.MonkeyPatch, as_it_is: float, stays: bool
+) -> None:
+    round_about = Standing(Rotation.from_euler("y", 180, degrees=True).as_matrix(), 0.001)
+    errors = {"rest_error": 31.0, "_rest_error": as_it_is}
+    monkeypatch.setattr(module, "standing", lambda *_: round_about)
+    for name, error in errors.items():
+        monkeypatch.setattr(module, name, lambda *_, error=error: error)
+    found = module.stands(lively("parts"), Mesh(BODY, np.empty((0, 3), np.int64)))
+    assert np.array_equal(found.matrix, np.eye(3)) == stays
+    assert found.rest_error == (as_it_is if stays else 31.0) and (found.root is not None) == stays

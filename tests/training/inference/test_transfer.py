@@ -43,7 +43,7 @@ def test_a_way_to_stand_that_is_told_may_be_of_another_mesh(monkeypatch: pytest.
 
     monkeypatch.setattr(transfer, "facing", watched)
     posing = PoseTransfer(lively("parts"))
-    found = posing.standing(body.vertices)
+    found = posing.standing(body)
     posing(source=body, target=body)
     posing(source=body, target=body, source_axes=found, target_axes=found)
     assert known == [True, True, False, False]

@@ -10,7 +10,17 @@ import torch
 import yaml
 
 from datagen.generate import generate
-from datagen.recipe import AmassPoses, Body, ClipPoses, DatasetRecipe, FilePoses, FoundPoses, NptPoses, RangePoses
+from datagen.recipe import (
+    AmassPoses,
+    AnatomicalPoses,
+    Body,
+    ClipPoses,
+    DatasetRecipe,
+    FilePoses,
+    FoundPoses,
+    NptPoses,
+    RangePoses,
+)
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import mixed_dataset, tiny_training
 from tests.support.workflows import finished_workflow
@@ -82,7 +92,7 @@ def test_a_contact_sheet_is_shown_where_it_is(dataset: str, tmp_path: Path) -> N
 def test_every_family_distribution_and_network_has_its_words() -> None:
     families = {kind.model_fields["family"].default for kind in get_args(get_args(Body)[0])}
     assert set(FAMILIES) == families - {"mixed"}
-    sources = (NptPoses, RangePoses, ClipPoses, AmassPoses, FilePoses, FoundPoses)
+    sources = (NptPoses, AnatomicalPoses, RangePoses, ClipPoses, AmassPoses, FilePoses, FoundPoses)
     assert set(POSES) == {kind.model_fields["name"].default for kind in sources}
     assert set(NETWORKS) == set(NETWORK_NAMES)
     assert len(family_texts(mixed_dataset().body)) == 1, "a family that comes thrice is told once"

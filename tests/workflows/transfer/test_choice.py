@@ -58,8 +58,8 @@ class Understanding:
             posed[:3] = 10 * target.vertices[:3]  # half of it whatever the weights
         return Mesh(posed, target.faces)
 
-    def standing(self, vertices: np.ndarray) -> Standing:
-        return Standing(np.eye(3), self.misfit(vertices))
+    def standing(self, mesh: Mesh) -> Standing:
+        return Standing(np.eye(3), self.misfit(mesh.vertices))
 
 
 @pytest.fixture

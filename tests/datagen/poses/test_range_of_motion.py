@@ -1,0 +1,69 @@
+"""Poses over people's whole range of motion."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from datagen.poses import JOINTS, draw_poses, load_poses
+from datagen.poses.range_of_motion import ARM, LEG, TRUNK, Motion
+from datagen.recipe import AnatomicalPoses, PoseRecipe
+
+RECIPE = PoseRecipe(seen=600, unseen=200, distribution=AnatomicalPoses())
+
+
+@pytest.fixture(scope="module")
+def degrees() -> np.ndarray:
+    """Axis-angle components [pose, 24, 3] in degrees."""
+    return np.degrees(draw_poses(RECIPE, range(800)).rotations)
+
+
+def test_every_joint_but_the_pelvis_moves_and_each_has_one_motion(degrees: np.ndarray) -> None:
+    still = [name for joint, name in enumerate(JOINTS) if not degrees[:, joint].any()]
+    assert still == ["pelvis"]
+    named = [joint for motion in (*TRUNK, *ARM, *LEG) for joint in motion.joints]
+    assert sorted(named) == sorted(joint for joint in JOINTS if not joint.startswith(("right", "pelvis")))
+
+
+def test_hinges_fill_their_range_and_stay_inside(degrees: np.ndarray) -> None:
+    knee = degrees[:, JOINTS.index("left_knee"), 0]
+    assert knee.min() >= -1 and 125 < knee.max() < 147, "a swing of up to 145 degrees with a twist of up to 10"
+    elbow = degrees[:, JOINTS.index("left_elbow"), 1]
+    assert -148 < elbow.min() < -125 and elbow.max() <= 1
+
+
+def test_the_right_side_mirrors_the_left_ones_ranges(degrees: np.ndarray) -> None:
+    assert degrees[:, JOINTS.index("right_elbow"), 1].max() > 125, "it bends the other way about y"
+    assert degrees[:, JOINTS.index("right_knee"), 0].max() > 125, "and the same way about x"
+    left, right = (degrees[:, JOINTS.index(f"{side}_shoulder")] for side in ("left", "right"))
+    assert not np.allclose(left * [1, -1, -1], right), "each by a draw of its own"
+    assert np.allclose(np.quantile(left, 0.9, axis=0), np.quantile(right * [1, -1, -1], 0.9, axis=0), atol=9)
+
+
+def test_joints_of_a_chain_share_its_motion_equally(degrees: np.ndarray) -> None:
+    spine = degrees[:, [JOINTS.index(name) for name in ("spine1", "spine2", "spine3")]]
+    assert np.ptp(spine, axis=1).max() == 0 and 20 < spine[..., 0].max() <= 25
+
+
+def test_a_swing_stays_in_its_ellipse_and_a_twist_in_its_range() -> None:
+    shoulder, random = ARM[1], np.random.default_rng(0)
+    drawn = Rotation.from_rotvec([shoulder.draw(random, 1.0) for _ in range(2_000)])
+    bone = np.array([1.0, 0, 0])
+    moved = drawn.apply(bone)
+    swing = np.degrees(np.cross(bone, moved) * (np.arccos(moved[:, 0]) / np.linalg.norm(moved[:, 1:], axis=1))[:, None])
+    centre, half = np.array([-37.5, -7.5]), np.array([72.5, 87.5])
+    radii = np.linalg.norm((swing[:, 1:] - centre) / half, axis=1)
+    assert 0.97 < radii.max() <= 1 + 1e-6
+    assert abs(np.mean(radii < 0.5) - 0.25) < 0.04, "even by area"
+
+
+def test_a_share_of_a_motion_is_that_part_of_its_angles() -> None:
+    bend = Motion(("left_knee",), 1, x=(0, 100))
+    whole, half = (bend.draw(np.random.default_rng(3), share) for share in (1.0, 0.5))
+    assert np.allclose(half, whole / 2) and whole[0] > 0 and not whole[1:].any()
+
+
+def test_a_pose_is_a_function_of_seed_and_number_alone() -> None:
+    other = PoseRecipe(seen=3, unseen=10, distribution=AnatomicalPoses())
+    assert np.array_equal(load_poses(RECIPE).draw(7), load_poses(other).draw(7))
+    again = PoseRecipe(seen=3, unseen=10, distribution=AnatomicalPoses(), seed=1)
+    assert not np.array_equal(load_poses(RECIPE).draw(7), load_poses(again).draw(7))
