@@ -46,11 +46,12 @@ animals that were read rightly by weights of their kind have less, things have m
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands; bare people have 0.0013 at most
 (docs/results/transfer.md)."""
-_STRAIGHT = np.radians(6.0)  # a facing that may be an error of the network's own
+_STRAIGHT = np.radians(9.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _SURELY = 2.0, 6.0  # times less by a few vertices, of a mesh that is understood twice as well as it must be, of others
+_NEARLY = 1.25  # times the rest error of another way: as well read
 _SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
@@ -154,16 +155,17 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 def stands(network: Parts, mesh: Mesh) -> Standing:
     """Find how a mesh stands (`standing`), told its surface where another way than as it is was found.
 
-    Where parts touch, as a hand does a hip, vertices alone are misunderstood, and another way may seem clearer. It is
-    not taken where the mesh is misread then, and as it is has less than half of that rest error.
+    Where parts touch, as a hand does a hip, vertices alone are misunderstood, and another way may seem clearer. A mesh
+    that is read to face straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so.
     """
     understand = understanding_of(network)
     found = standing(understand, mesh.vertices)
     if np.array_equal(found.matrix, np.eye(3)):
         return found
     error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
-    if error > MISREAD and (as_it_is := _rest_error(network, mesh)) < error / 2:
-        found, error = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([np.eye(3)])[0].stands, as_it_is
+    as_it_is, root = _read(network, mesh)
+    if as_it_is <= _NEARLY * error and abs(_facing(root)) <= _STRAIGHT:
+        found, error = Standing(np.eye(3), misfit(understand, mesh.vertices), root=root), as_it_is
     return replace(found, rest_error=error)
 
 
@@ -171,7 +173,7 @@ def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float
     """Return the turn [3, 3] of a body with Y up from upright and facing +Z: ``before`` but for a clear change.
 
     ``before`` is the turn [3, 3] of the last frame, or how this very body was found to stand. A change is clear about
-    the vertical (above 6 degrees), or about any axis where the body leans by more than 12 degrees, seen from
+    the vertical (above 9 degrees), or about any axis where the body leans by more than 12 degrees, seen from
     ``before``, and has a lesser misfit upright.
     """
     probe = _probe(vertices)
@@ -201,12 +203,15 @@ def misfit(understand: Understanding, vertices: Floats) -> float:
 def rest_error(network: Parts, mesh: Mesh) -> float:
     """Return by how many degrees a mesh that stands with Y up is misread (`Parts.rest_error`)."""
     upright = mesh.vertices @ facing(understanding_of(network), mesh.vertices, np.eye(3))
-    return _rest_error(network, Mesh(upright, mesh.faces))
+    return _read(network, Mesh(upright, mesh.faces))[0]
 
 
-def _rest_error(network: Parts, mesh: Mesh) -> float:
+@torch.no_grad()
+def _read(network: Parts, mesh: Mesh) -> tuple[float, NDArray[np.float64]]:
+    """The rest error of a mesh as it is, and how its root is turned from rest [3, 3]."""
     drawn = sampled(network, mesh)
-    return float(network.rest_error(network.read(drawn), drawn))
+    reading = network.read(drawn)
+    return float(network.rest_error(reading, drawn)), reading.rotations[0, 0].double().cpu().numpy()
 
 
 def sampled(network: Parts, mesh: Mesh) -> Sample:

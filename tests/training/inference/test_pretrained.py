@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from benchmarks.transfer.everyday import Person
 from datagen.bodies import load_body
 from datagen.common.seeding import Stream, generator
 from datagen.mesh.geometry import Mesh, bounding_box
@@ -55,6 +56,14 @@ def test_new_people_are_brought_into_new_poses(weights: str, most: float) -> Non
     unchanged = np.broadcast_to(case.truths[:1], outputs.shape)
     error, doing_nothing = (pmd(found, case.truths[1:]) for found in (outputs, unchanged))
     assert error < most and 8 * error < doing_nothing
+
+
+@pytest.mark.parametrize("pose", ["sitting", "arms crossed", "reading", "hands on hips", "running", "telephone"])
+def test_everyday_poses_are_taken(human: PoseTransfer, pose: str) -> None:
+    """Of which NPT's joint ranges have none."""
+    source, target = Person(0.5, "notoes_collapse5pc", 1), Person(0.8, "notoes_collapse5pc", 2)
+    posed = human.unplaced(source(pose), target("standing"))
+    assert pmd(posed[None], target(pose).vertices[None]) < 0.001
 
 
 def test_what_is_read_of_a_body_that_is_not_dense_is_most_of_it() -> None:
@@ -132,10 +141,10 @@ def test_noise_of_a_source_is_mostly_filtered(human: PoseTransfer) -> None:
 
 def test_what_is_no_person_is_said_to_be_strange(human: PoseTransfer) -> None:
     box = Mesh(np.random.default_rng(0).uniform(-1, 1, (400, 3)), np.array([[0, 1, 2]]))
-    found = human.standing(box.vertices)
+    found = human.standing(box)
     assert human.rest_error(Mesh(found.upright(box.vertices), box.faces)) > 1.5 * MISREAD
     target = people(poses=1).target
-    known = human.standing(target.vertices)
+    known = human.standing(target)
     assert isinstance(known, Standing) and np.array_equal(known.matrix, np.eye(3))
     assert human.rest_error(target) < 0.75 * MISREAD
 
