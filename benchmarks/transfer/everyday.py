@@ -1,9 +1,9 @@
 """Poses of everyday life, made by hand: ``python -m benchmarks.transfer.everyday FOLDER [--weights W]``.
 
 A grown-up sits, squats, folds the arms, looks over the shoulder, crawls; a child, and an old person of 13,718 vertices,
-each in another of these poses, take them. No distribution that anything was trained on has made them. Printed, pose by
-pose: PMD, millimetres and the normals' error of both, the best turn taken out; drawn, in FOLDER: source, target, output
-and truth. Two minutes of one core.
+take these poses from that which is half of the list further on. Nothing was trained on them. Printed are, pose by pose,
+the rest error of the source in degrees and, of both, PMD, millimetres and the normals' error, the best turn taken out;
+drawn, in FOLDER, source, target, output and truth. Two minutes of one core.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _IN_A_PICTURE = 7
 _PANEL = (300, 300)
 
 Turns = dict[str, tuple[float, ...]]
-"""Joints of the left side or the middle, each turned about SMPL's x, then y, then z, in degrees."""
+"""Joints of a side, as the left one's, or of the middle, each turned about SMPL's x, then y, then z, in degrees."""
 
 HANGING: Turns = {"shoulder": (0, 0, -75)}
 POSES: dict[str, tuple[Turns, Turns]] = {  # what both sides do, and what the right one does in its place
@@ -166,6 +166,7 @@ class Person:
         self._who = self._body.draw_identity(generator(98, Stream.IDENTITY, number), number)
 
     def __call__(self, name: str) -> Mesh:
+        """The person in a pose, in metres, Y up, facing +Z."""
         poses = Poses(JOINTS, PARENTS, axis_angles(*POSES[name])[None])
         return Mesh(self._body.vertices(self._who, poses)[0].astype(np.float64), self._body.faces(self._who))
 

@@ -21,7 +21,8 @@ class Motion:
     """How far a joint, or a chain of joints that share it equally, turns; degrees about SMPL's axes of the left side.
 
     A rotation is a swing, which moves the bone, after a twist about the bone itself (``bone``: which of x, y and z it
-    lies along at rest). The swing's two components lie within an ellipse whose axes are the two ranges.
+    lies along at rest). The swing's two components lie within an ellipse whose axes are the two ranges; that of a
+    hinge, which has one, is seldom near its ends.
     """
 
     joints: tuple[str, ...]
@@ -42,6 +43,7 @@ class Motion:
         return (swung * twisted).as_rotvec()
 
 
+# Healthy grown-ups' ranges of motion, rounded, as in tables of the American Academy of Orthopaedic Surgeons (AAOS).
 X, Y, Z = range(3)
 TRUNK = (
     Motion(("spine1", "spine2", "spine3"), Y, x=(-25, 75), y=(-45, 45), z=(-35, 35)),
@@ -60,7 +62,6 @@ LEG = (
     Motion(("left_ankle",), Y, x=(-25, 50), y=(-15, 15), z=(-15, 15)),
     Motion(("left_foot",), Z, x=(-35, 15)),
 )
-"""Ranges of motion of healthy grown-ups, rounded, as in tables of the American Academy of Orthopaedic Surgeons."""
 
 
 _LIMBS = ((TRUNK, ("left",), 1.0), (ARM, ("left", "right"), 0.0), (LEG, ("left", "right"), 0.5))
@@ -72,8 +73,9 @@ class AnatomicalSource:
     """See :class:`datagen.poses.PoseSource`: each limb by a share of its range, over SMPL's joints.
 
     The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
-    arms hang, reach and fold. In a third of the poses both arms do the same, as do both legs in another third. Else
-    joints are independent, so there are poses that nobody takes, and limbs may go through the body.
+    arms hang, reach and fold. In a third of the poses both arms do the same, and independently in a third both legs.
+    Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
+    ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
     """
 
     joints, parents = JOINTS, PARENTS

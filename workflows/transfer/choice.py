@@ -16,6 +16,9 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
+_WEIGHT = {"dressed": 1.4}
+"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which knows fewer poses, is to
+read people clearly better than `human` does (docs/results/transfer.md)."""
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
 
@@ -126,7 +129,7 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     kind = target or source or KINDS["human"]
     known = [place for place in range(2) if kinds[place] == kind]
     able = [name for name in every if KINDS[name] == kind]
-    taken = min(able, key=lambda name: max((errors[name][place] for place in known), default=0))
+    taken = min(able, key=lambda name: _WEIGHT.get(name, 1) * max([errors[name][place] for place in known] or [0]))
     why = f"they know {(job.sources[0], job.target)[known[-1]]}" if known else "for every such mesh"
     reason = f"the weights {taken} are taken, as {why}. {POOR}"
     doubts = (

@@ -67,3 +67,26 @@ def test_a_pose_is_a_function_of_seed_and_number_alone() -> None:
     assert np.array_equal(load_poses(RECIPE).draw(7), load_poses(other).draw(7))
     again = PoseRecipe(seen=3, unseen=10, distribution=AnatomicalPoses(), seed=1)
     assert not np.array_equal(load_poses(RECIPE).draw(7), load_poses(again).draw(7))
+
+
+def test_both_arms_do_the_same_in_a_third_of_the_poses_and_independently_both_legs(degrees: np.ndarray) -> None:
+    mirror = np.array([1, -1, -1])
+    alike = {
+        name: np.all(
+            degrees[:, JOINTS.index(f"left_{name}")] == degrees[:, JOINTS.index(f"right_{name}")] * mirror, axis=1
+        )
+        for name in ("shoulder", "elbow", "hip", "knee")
+    }
+    assert np.array_equal(alike["shoulder"], alike["elbow"]) and np.array_equal(alike["hip"], alike["knee"])
+    arms, legs = alike["shoulder"], alike["hip"]
+    assert abs(arms.mean() - 1 / 3) < 0.05 and abs(legs.mean() - 1 / 3) < 0.05
+    assert abs((arms & legs).mean() - 1 / 9) < 0.04
+
+
+def test_a_share_of_the_poses_may_be_npts() -> None:
+    mixed = PoseRecipe(seen=400, unseen=0, distribution=AnatomicalPoses(npt=0.25))
+    poses = np.degrees(draw_poses(mixed, range(400)).rotations)
+    straight = np.abs(poses[:, [JOINTS.index(name) for name in ("head", "spine1")]]).max(axis=(1, 2)) <= 1
+    of_npt = straight & (poses[:, JOINTS.index("pelvis")] != 0).all(axis=1)
+    assert abs(of_npt.mean() - 0.25) < 0.06
+    assert not poses[~of_npt, JOINTS.index("pelvis")].any()

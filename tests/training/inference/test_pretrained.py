@@ -58,12 +58,25 @@ def test_new_people_are_brought_into_new_poses(weights: str, most: float) -> Non
     assert error < most and 8 * error < doing_nothing
 
 
-@pytest.mark.parametrize("pose", ["sitting", "arms crossed", "reading", "hands on hips", "running", "telephone"])
+@pytest.mark.parametrize("pose", ["sitting", "arms crossed", "reading", "hands on hips", "waving", "telephone"])
 def test_everyday_poses_are_taken(human: PoseTransfer, pose: str) -> None:
     """Of which NPT's joint ranges have none."""
     source, target = Person(0.5, "notoes_collapse5pc", 1), Person(0.8, "notoes_collapse5pc", 2)
     posed = human.unplaced(source(pose), target("standing"))
-    assert pmd(posed[None], target(pose).vertices[None]) < 0.001
+    assert pmd(posed[None], target(pose).vertices[None]) < 0.0008
+
+
+@pytest.mark.parametrize("pose", ["hands on hips", "cross-legged", "on one leg"])
+@pytest.mark.parametrize("way", [("y", 0), ("y", 180), ("x", -90)])
+def test_people_who_fold_their_limbs_are_found_to_stand_as_they_do(
+    human: PoseTransfer, pose: str, way: tuple[str, float]
+) -> None:
+    """Of whom vertices alone are misunderstood: their surface decides."""
+    mesh, turn = Person(0.55, "notoes_collapse10pc", 3)(pose), Rotation.from_euler(*way, degrees=True)
+    found = human.standing(Mesh(turn.apply(mesh.vertices), mesh.faces))
+    assert isinstance(found, Standing)
+    left = Rotation.from_matrix(found.lean.T @ found.matrix) * turn
+    assert np.degrees(left.magnitude()) < 15
 
 
 def test_what_is_read_of_a_body_that_is_not_dense_is_most_of_it() -> None:

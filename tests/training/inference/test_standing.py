@@ -263,7 +263,8 @@ def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
     round_about = Standing(Rotation.from_euler("y", 180, degrees=True).as_matrix(), 0.001)
     monkeypatch.setattr(module, "standing", lambda *_: round_about)
     monkeypatch.setattr(module, "rest_error", lambda *_: 4.0)
-    monkeypatch.setattr(module, "_read", lambda *_: (as_it_is, root))
-    found = module.stands(lively("parts"), Mesh(BODY, np.empty((0, 3), np.int64)))
+    body = Mesh(BODY, np.empty((0, 3), np.int64))
+    monkeypatch.setattr(module, "_read", lambda _, mesh: (as_it_is, root) if mesh is body else (4.0, np.eye(3)))
+    found = module.stands(lively("parts"), body)
     assert np.array_equal(found.matrix, np.eye(3)) == stays
     assert found.rest_error == (as_it_is if stays else 4.0) and (found.root is root) == stays
