@@ -43,6 +43,9 @@ def understanding_of(network: Parts) -> Understanding:
 MISREAD = 7.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
 animals that were read rightly by weights of their kind have less, things have more (docs/results/transfer.md)."""
+SURELY_READ = 5.0
+"""Degrees of rest error up to which an upright mesh that faces ahead is read rightly: people and animals turned by a
+quarter or a half, and read so all the same, have more (docs/results/parts.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are, and half of those
 who fold their limbs (docs/results/transfer.md)."""
@@ -155,39 +158,45 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 def stands(network: Parts, mesh: Mesh) -> Standing:
     """Find how a mesh stands (`standing`), told its surface where it is not well understood as it is.
 
-    Where parts touch, as a hand does a hip, vertices alone are misunderstood. So a mesh that is misread as it is, is
-    turned by quarters about the vertical, where that makes the rest error clearly less; and of one for which another
-    way was found, the facing is corrected. One that is read to face straight ahead as it is, with a rest error of at
-    most 1.25 times the other way's, stays so.
+    Where parts touch, as a hand does a hip, vertices alone are misunderstood. So a mesh that stands upright, faces
+    ahead and has a rest error of at most `SURELY_READ` as it is, stays so, unasked for other ways; one that is misread
+    as it is, is turned by quarters about the vertical, where that makes the rest error clearly less. Of a mesh for
+    which another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a
+    rest error of at most 1.25 times the other way's, stays so.
     """
-    understand = understanding_of(network)
+    understand, eye = understanding_of(network), np.eye(3)
+    seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
+    as_it_is, root = _read(network, mesh) if seen.misfit > KNOWN else (np.nan, seen.root)
+    if as_it_is <= SURELY_READ and abs(_facing(root)) <= _STRAIGHT and _leaning(root) <= _UPRIGHT:
+        return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
     found = standing(understand, mesh.vertices)
-    is_as_it_is = np.array_equal(found.matrix, np.eye(3)) and np.array_equal(found.lean, np.eye(3))
-    if is_as_it_is and found.misfit <= KNOWN:
-        return found
-
-    def turned(way: NDArray[np.float64]) -> Mesh:
-        return Mesh(mesh.vertices @ way.T, mesh.faces)
-
-    as_it_is, root = _read(network, mesh)
-    if is_as_it_is:
-        if as_it_is <= MISREAD:
-            return replace(found, rest_error=as_it_is)
-        way = min(map(_about_vertical, _QUARTERS), key=lambda way: _read(network, turned(way))[0])
-        error = _read(network, turned(way))[0]
-        if _CLEARLY * error >= as_it_is:
-            return replace(found, rest_error=rest_error(network, mesh))
-        found = Standing(way, misfit(understand, turned(way).vertices))
-    else:
-        error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
-        if as_it_is <= _NEARLY * error and abs(_facing(root)) <= _STRAIGHT:
-            return Standing(np.eye(3), misfit(understand, mesh.vertices), rest_error=as_it_is, root=root)
-    if np.array_equal(found.lean, np.eye(3)):
-        aside = _facing(_read(network, turned(found.matrix))[1])
-        if abs(aside) > _STRAIGHT:
-            way = _about_vertical(-aside) @ found.matrix
-            found, error = Standing(way, misfit(understand, turned(way).vertices)), _read(network, turned(way))[0]
+    if np.array_equal(found.matrix, eye) and np.array_equal(found.lean, eye):
+        return found if np.isnan(as_it_is) else _quarter_turned(network, mesh, replace(found, rest_error=as_it_is))
+    error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
+    if np.isnan(as_it_is):
+        as_it_is, root = _read(network, mesh)
+    if as_it_is <= _NEARLY * error and abs(_facing(root)) <= _STRAIGHT:
+        return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
+    aside = _facing(_read(network, Mesh(found.turned(mesh.vertices), mesh.faces))[1])
+    if abs(aside) > _STRAIGHT and np.array_equal(found.lean, eye):
+        return _by(network, mesh, _about_vertical(-aside) @ found.matrix)
     return replace(found, rest_error=error)
+
+
+def _quarter_turned(network: Parts, mesh: Mesh, as_it_is: Standing) -> Standing:
+    """How a mesh stands that no other way was found for: as it is, or, if that is misread, a clearer quarter turn."""
+    if as_it_is.rest_error <= MISREAD:
+        return as_it_is
+    best = min((_by(network, mesh, _about_vertical(angle)) for angle in _QUARTERS), key=lambda way: way.rest_error)
+    if _CLEARLY * best.rest_error < as_it_is.rest_error:
+        return best
+    return replace(as_it_is, rest_error=rest_error(network, mesh))
+
+
+def _by(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
+    """A mesh turned in this way [3, 3], its surface read."""
+    turned = Mesh(mesh.vertices @ way.T, mesh.faces)
+    return Standing(way, misfit(understanding_of(network), turned.vertices), rest_error=_read(network, turned)[0])
 
 
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64] | Standing) -> NDArray[np.float64]:

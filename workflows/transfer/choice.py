@@ -10,7 +10,7 @@ from datagen.common.errors import MeshError
 from datagen.mesh.geometry import Mesh
 from training.inference.domain_check import POOR, Tears
 from training.inference.orientation import Axes
-from training.inference.standing import KNOWN, MISREAD, Standing
+from training.inference.standing import KNOWN, MISREAD, SURELY_READ, Standing
 from training.inference.transfer import PoseTransfer
 from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
@@ -48,6 +48,11 @@ class Chosen:
     def is_read(self) -> bool:
         """Whether both meshes are such bodies as the weights know."""
         return all(found.rest_error <= MISREAD for found in self.standings)
+
+    @property
+    def is_surely_read(self) -> bool:
+        """Whether both meshes are such bodies beyond doubt."""
+        return all(found.rest_error <= SURELY_READ for found in self.standings)
 
     @property
     def is_sure(self) -> bool:
@@ -96,9 +101,10 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     """Return the weights that know both meshes best; of meshes that none knows, `human`.
 
     The others are not asked where `human` knows both well: among all the ways to turn an animal there may be one in
-    which it passes for a person, but worse by far than people do. Nor is `dressed` where `animals` knows both well, and
-    better than `human` does. But where `human`, sure of both, tears the target in the first source's pose, as it may a
-    skirt, and `dressed` reads both and tears at most half as many edges, the latter is taken.
+    which it passes for a person, but worse by far than people do. Nor are `animals` where it reads both surely, nor is
+    `dressed` where `animals` knows both well, and better than `human` does. But where `human`, sure of both, tears the
+    target in the first source's pose, as it may a skirt, and `dressed` reads both and tears at most half as many edges,
+    the latter is taken.
 
     Raises
     ------
@@ -114,11 +120,11 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
         dressed = dressed.tried(meshes) if dressed.is_read else dressed
         return dressed if dressed.is_read and dressed.torn(meshes[1]) <= torn / 2 else people
-    animals = Chosen.of(own_weights("animals"), job, meshes, load)
-    if animals.is_sure and animals.reads_better_than(people):
+    animals = None if people.is_surely_read else Chosen.of(own_weights("animals"), job, meshes, load)
+    if animals and animals.is_sure and animals.reads_better_than(people):
         return animals
     dressed = Chosen.of(own_weights("dressed"), job, meshes, load)
-    every = {"human": people, "dressed": dressed, "animals": animals}
+    every = {"human": people, "dressed": dressed, **({"animals": animals} if animals else {})}
     errors = {name: [found.rest_error for found in each.standings] for name, each in every.items()}
     source, target = kinds = [_kind(errors, place) for place in range(2)]
     if source and target and source != target and not force:

@@ -265,6 +265,7 @@ def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
     monkeypatch.setattr(module, "rest_error", lambda *_: 4.0)
     body = Mesh(BODY, np.empty((0, 3), np.int64))
     monkeypatch.setattr(module, "_read", lambda _, mesh: (as_it_is, root) if mesh is body else (4.0, np.eye(3)))
+    monkeypatch.setattr(module, "SURELY_READ", 3.0)
     found = module.stands(lively("parts"), body)
     assert np.array_equal(found.matrix, np.eye(3)) == stays
     assert found.rest_error == (as_it_is if stays else 4.0) and (found.root is root) == stays
