@@ -1,7 +1,8 @@
 """By how many degrees weights err that find how a mesh stands: ``python -m benchmarks.transfer.standing human``.
 
-Anny bodies that the weights have not seen, of several vertex layouts, turned in several ways; then what that comes to
-in transfers between forty pairs of them. Set OMP_NUM_THREADS=1 on a busy machine. Ten CPU minutes.
+Anny bodies that the weights have not seen, of several vertex layouts, in NPT's poses and over the whole range of
+motion, turned in several ways; then what that comes to in transfers between forty pairs of them in NPT's poses. Set
+OMP_NUM_THREADS=1 on a busy machine. Twenty CPU minutes.
 """
 
 from __future__ import annotations
@@ -17,18 +18,28 @@ from scipy.spatial.transform import Rotation
 from datagen.bodies import load_body
 from datagen.mesh.geometry import Mesh, bounding_box
 from datagen.poses import draw_poses
-from datagen.recipe import AnnyBody, AnnyTopology, PhenotypeRanges, PoseRecipe
+from datagen.recipe import AnatomicalPoses, AnnyBody, AnnyTopology, NptPoses, PhenotypeRanges, PoseRecipe
 from training.inference.predict import load_trained
-from training.inference.standing import Understanding, facing, standing, understanding_of
+from training.inference.standing import facing, stands, understanding_of
 from training.inference.transfer import PoseTransfer
 from training.networks.parts import Parts
 from training.objectives import PMD_UNIT
 from workflows.pretrained import weights_named
 
-BODIES: tuple[tuple[AnnyTopology, int, int], ...] = (
-    ("notoes_collapse5pc", 20, 3), ("notoes_collapse3pc", 10, 2), ("notoes_collapse10pc", 10, 2), ("anny", 10, 2),
+
+class Bodies(NamedTuple):
+    """Bodies of one vertex layout, their poses a body, and what these are drawn from."""
+
+    topology: AnnyTopology
+    identities: int
+    poses: int
+    distribution: NptPoses | AnatomicalPoses = NptPoses()
+
+
+BODIES = (
+    Bodies("notoes_collapse5pc", 20, 3), Bodies("notoes_collapse3pc", 10, 2), Bodies("notoes_collapse10pc", 10, 2),
+    Bodies("anny", 10, 2), Bodies("notoes_collapse5pc", 20, 3, AnatomicalPoses()),
 )  # fmt: skip
-"""Topology, identities, poses of each."""
 
 
 def main() -> None:
@@ -38,26 +49,28 @@ def main() -> None:
     network = load_trained(weights_named(parser.parse_args().weights))[0]
     if not isinstance(network, Parts):
         parser.error("these weights are of a network that does not find how meshes stand")
-    for topology, identities, poses in BODIES:
-        report_found(understanding_of(network), list(anny(topology, identities, poses)))
+    for bodies in BODIES:
+        report_found(network, bodies)
     report_transfers(PoseTransfer(network), list(pairs(40)))
 
 
-def anny(topology: AnnyTopology, identities: int, poses: int) -> Iterator[NDArray[np.float64]]:
-    """Vertices [n, 3] of bodies from babies to old people in poses as the recipes draw them."""
-    body = load_body(AnnyBody(topology=topology, phenotypes=PhenotypeRanges(age=(0.0, 1.0))))
-    recipe = PoseRecipe(seen=identities * poses, unseen=0, seed=11)
-    for identity in range(identities):
+def anny(bodies: Bodies) -> Iterator[Mesh]:
+    """Bodies from babies to old people, each in poses of its own."""
+    body = load_body(AnnyBody(topology=bodies.topology, phenotypes=PhenotypeRanges(age=(0.0, 1.0))))
+    recipe = PoseRecipe(seen=bodies.identities * bodies.poses, unseen=0, seed=1011, distribution=bodies.distribution)
+    for identity in range(bodies.identities):
         parameters = body.draw_identity(np.random.default_rng(1000 + identity), identity)
-        drawn = draw_poses(recipe, np.arange(identity * poses, (identity + 1) * poses))
-        yield from body.vertices(parameters, drawn).astype(np.float64)
+        drawn = draw_poses(recipe, np.arange(bodies.poses) + identity * bodies.poses)
+        for vertices in body.vertices(parameters, drawn):
+            yield Mesh(vertices.astype(np.float64), body.faces(parameters))
 
 
-def report_found(understand: Understanding, meshes: list[NDArray[np.floating]]) -> None:
+def report_found(network: Parts, bodies: Bodies) -> None:
     """Degrees by which bodies are from upright after their axes were found, and as they are read: after their lean was,
     too, which is given back to what is posed.
     """
-    random = np.random.default_rng(0)
+    random, understand, meshes = np.random.default_rng(0), understanding_of(network), list(anny(bodies))
+    print(f"{len(meshes[0].vertices):,} vertices, poses {bodies.distribution.name}:")
     kinds: dict[str, Callable[[], Rotation]] = {
         "upright": Rotation.identity,
         "about the vertical by any angle": lambda: Rotation.from_euler("y", random.uniform(0, 2 * np.pi)),
@@ -69,12 +82,13 @@ def report_found(understand: Understanding, meshes: list[NDArray[np.floating]]) 
         left, as_read = list[float](), list[float]()
         for mesh in meshes:
             turn = draw()
-            stands = standing(understand, turn.apply(mesh))
-            lean = Rotation.from_matrix(facing(understand, stands.turned(turn.apply(mesh)), stands.lean))
-            found = Rotation.from_matrix(stands.matrix) * turn
+            turned = Mesh(turn.apply(mesh.vertices), mesh.faces)
+            stood = stands(network, turned)
+            lean = Rotation.from_matrix(facing(understand, stood.turned(turned.vertices), stood))
+            found = Rotation.from_matrix(stood.matrix) * turn
             left.append(np.degrees(found.magnitude()))
             as_read.append(np.degrees((lean.inv() * found).magnitude()))
-        print(f"{len(meshes[0]):,} vertices, {kind}: {told(left)}; as read {told(as_read)}", flush=True)
+        print(f"  {kind}: {told(left)}; as read {told(as_read)}", flush=True)
 
 
 def told(degrees: list[float]) -> str:
@@ -97,7 +111,7 @@ class Pair(NamedTuple):
 def pairs(count: int) -> Iterator[Pair]:
     """Pairs of people of all ages, of 615 vertices."""
     body = load_body(AnnyBody(topology="notoes_collapse5pc", phenotypes=PhenotypeRanges(age=(0.0, 1.0))))
-    recipe = PoseRecipe(seen=2 * count, unseen=0, seed=12)
+    recipe = PoseRecipe(seen=2 * count, unseen=0, seed=1012)
     for number in range(count):
         people = [body.draw_identity(np.random.default_rng(2000 + 2 * number + who), who) for who in (0, 1)]
         poses = draw_poses(recipe, [2 * number, 2 * number + 1])

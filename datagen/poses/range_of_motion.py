@@ -62,10 +62,19 @@ LEG = (
     Motion(("left_ankle",), Y, x=(-25, 50), y=(-15, 15), z=(-15, 15)),
     Motion(("left_foot",), Z, x=(-35, 15)),
 )
+FOLDED_LEG = (  # as one squats, sits on the heels or hugs the knees: weight or arms bend the joints further
+    Motion(("left_hip",), Y, x=(-135, -75), y=(-30, 40), z=(-15, 45)),
+    Motion(("left_knee",), Y, x=(95, 155), y=(-10, 10)),
+    *LEG[2:],
+)
 
-
-_LIMBS = ((TRUNK, ("left",), 1.0), (ARM, ("left", "right"), 0.0), (LEG, ("left", "right"), 0.5))
-"""Limbs, their sides, and the power of a uniform number that their share is: trunks seldom far, arms by the whole."""
+_TRUNK, _ARMS, _LEGS, _FOLDED_LEGS = (  # limbs, their sides, and the power of a uniform number that their share is
+    (TRUNK, ("left",), 1.0),
+    (ARM, ("left", "right"), 0.0),
+    (LEG, ("left", "right"), 0.5),
+    (FOLDED_LEG, ("left", "right"), 0.0),
+)
+_SHARE_FOLDED = 1 / 6  # of poses: both legs are folded tightly
 _ALIKE = 1 / 3  # of poses: both arms do the same, and likewise both legs
 
 
@@ -73,7 +82,8 @@ class AnatomicalSource:
     """See :class:`datagen.poses.PoseSource`: each limb by a share of its range, over SMPL's joints.
 
     The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
-    arms hang, reach and fold. In a third of the poses both arms do the same, and independently in a third both legs.
+    arms hang, reach and fold; in a sixth of the poses both legs are folded tightly, by the whole of narrower ranges.
+    In a third of the poses both arms do the same, and independently in a third both legs.
     Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
     ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
     """
@@ -91,7 +101,8 @@ class AnatomicalSource:
         if random.uniform() < self._npt:
             return npt_pose(("bent", "straight")[pose % 2], random)
         rotations = np.zeros((len(JOINTS), 3))
-        for limb, sides, power in _LIMBS:
+        legs = _FOLDED_LEGS if random.uniform() < _SHARE_FOLDED else _LEGS
+        for limb, sides, power in (_TRUNK, _ARMS, legs):
             alike, turned = random.uniform() < _ALIKE, list[NDArray[np.float64]]()
             for side in sides:
                 if not turned or not alike:

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from datagen.poses import JOINTS, draw_poses, load_poses
-from datagen.poses.range_of_motion import ARM, LEG, TRUNK, Motion
+from datagen.poses.range_of_motion import ARM, FOLDED_LEG, LEG, TRUNK, Motion
 from datagen.recipe import AnatomicalPoses, PoseRecipe
 
 RECIPE = PoseRecipe(seen=600, unseen=200, distribution=AnatomicalPoses())
@@ -20,13 +20,16 @@ def degrees() -> np.ndarray:
 def test_every_joint_but_the_pelvis_moves_and_each_has_one_motion(degrees: np.ndarray) -> None:
     still = [name for joint, name in enumerate(JOINTS) if not degrees[:, joint].any()]
     assert still == ["pelvis"]
+    assert [motion.joints for motion in FOLDED_LEG] == [motion.joints for motion in LEG]
     named = [joint for motion in (*TRUNK, *ARM, *LEG) for joint in motion.joints]
     assert sorted(named) == sorted(joint for joint in JOINTS if not joint.startswith(("right", "pelvis")))
 
 
 def test_hinges_fill_their_range_and_stay_inside(degrees: np.ndarray) -> None:
     knee = degrees[:, JOINTS.index("left_knee"), 0]
-    assert knee.min() >= -1 and 125 < knee.max() < 147, "a swing of up to 145 degrees with a twist of up to 10"
+    assert knee.min() >= -1 and 145 < knee.max() < 157, "a swing of up to 155 degrees with a twist of up to 10"
+    stretched = knee[degrees[:, JOINTS.index("left_hip"), 0] > -60]
+    assert 125 < stretched.max() < 147, "of legs that are not folded one of up to 145"
     elbow = degrees[:, JOINTS.index("left_elbow"), 1]
     assert -148 < elbow.min() < -125 and elbow.max() <= 1
 
@@ -37,6 +40,14 @@ def test_the_right_side_mirrors_the_left_ones_ranges(degrees: np.ndarray) -> Non
     left, right = (degrees[:, JOINTS.index(f"{side}_shoulder")] for side in ("left", "right"))
     assert not np.allclose(left * [1, -1, -1], right), "each by a draw of its own"
     assert np.allclose(np.quantile(left, 0.9, axis=0), np.quantile(right * [1, -1, -1], 0.9, axis=0), atol=9)
+
+
+def test_both_legs_are_folded_tightly_in_a_sixth_of_the_poses(degrees: np.ndarray) -> None:
+    hips, knees = (
+        degrees[:, [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")], 0] for joint in ("hip", "knee")
+    )
+    tightly = ((hips < -65) & (knees > 90)).all(axis=1)
+    assert abs(tightly.mean() - (1 / 6 + 5 / 6 * 0.02)) < 0.015, "independent legs seldom are"
 
 
 def test_joints_of_a_chain_share_its_motion_equally(degrees: np.ndarray) -> None:
