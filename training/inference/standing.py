@@ -129,7 +129,7 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         at_first = _Ways(understand, points, _MORE_VERTICES)
         as_it_is = at_first.seen([np.eye(3)])[0]
     if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
-        return at_first.faced(as_it_is).stands if abs(as_it_is.facing) > _STRAIGHT else as_it_is.stands
+        return at_first.faced(as_it_is).stands if as_it_is.is_aside else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
     ahead = ways.ahead(best) if understood else None
@@ -261,6 +261,11 @@ class _Seen(NamedTuple):
     @property
     def facing(self) -> float:
         return _facing(self.root)
+
+    @property
+    def is_aside(self) -> bool:
+        """Whether it clearly faces elsewhere than ahead, which is read less well of a body that leans."""
+        return abs(self.facing) > (_STRAIGHT if _leaning(self.root) <= _UPRIGHT else 2 * _STRAIGHT)
 
     @property
     def stands(self) -> Standing:

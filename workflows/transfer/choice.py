@@ -16,9 +16,9 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
-_WEIGHT = {"dressed": 1.4}
-"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which knows fewer poses, is to
-read people clearly better than `human` does (docs/results/transfer.md)."""
+_WEIGHT = {"dressed": 1.15}
+"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which is less exact on bare
+people, is to read people clearly better than `human` does (docs/results/transfer.md)."""
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
 
