@@ -47,8 +47,8 @@ SURELY_READ = 5.0
 """Degrees of rest error up to which an upright mesh that faces ahead is read rightly: people and animals turned by a
 quarter or a half, and read so all the same, have more (docs/results/parts.md)."""
 KNOWN = 0.002
-"""Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are, and half of those
-who fold their limbs (docs/results/transfer.md)."""
+"""Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are
+(docs/results/transfer.md)."""
 _STRAIGHT = np.radians(9.0)  # a facing that may be an error of the network's own
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
