@@ -49,7 +49,7 @@ quarter or a half, and read so all the same, have more (docs/results/parts.md)."
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are
 (docs/results/transfer.md)."""
-_STRAIGHT = np.radians(9.0)  # a facing that may be an error of the network's own
+_STRAIGHT = np.radians(9.0)  # a facing that may be an error of the network's own; twice that of a leaning mesh
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
