@@ -185,7 +185,7 @@ def test_the_weights_that_come_along_tell_people_from_animals(
 
 
 def test_people_in_everyday_poses_are_posed_by_human() -> None:
-    """`dressed` reads who sits with less rest error, but not clearly less, and knows fewer poses."""
+    """`human` is not sure of who sits by vertices alone, and reads it better than `dressed` does all the same."""
     source, target = Person(0.55, "anny", 3)("sitting"), Person(0.25, "notoes_collapse5pc", 4)("standing")
     job = TransferJob([Path("a.obj")], Path("b.obj"), Path("c.obj"), is_sequence=False)
     found = chosen(job, (source, target), force=False)
