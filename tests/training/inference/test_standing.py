@@ -254,6 +254,20 @@ def test_a_body_that_turns_round_is_followed_from_frame_to_frame() -> None:
 
 
 @pytest.mark.parametrize(
+    ("aside", "lean", "stays"), [(8, 0, True), (12, 0, False), (8, 30, True), (12, 30, True), (20, 30, False)]
+)
+def test_a_facing_is_undone_from_9_degrees_on_and_of_a_body_that_leans_from_18(
+    aside: float, lean: float, stays: bool
+) -> None:
+    root = Rotation.from_euler("YX", [aside, lean], degrees=True)
+
+    def read(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return understand(meshes)[0], np.stack([(turn * root).as_matrix() for turn in turns_of(meshes)])
+
+    assert np.array_equal(standing(read, BODY).matrix, np.eye(3)) == stays
+
+
+@pytest.mark.parametrize(
     ("as_it_is", "facing_by", "stays"), [(4.7, 0, True), (4.9, 8, True), (4.7, 30, False), (5.1, 0, False)]
 )
 def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
