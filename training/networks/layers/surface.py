@@ -29,6 +29,9 @@ _CRUMB = 0.01
 """Of the vertices: a piece with fewer is near to all, lest triangles that share no vertices be cells each."""
 _FAR = 0.35
 """Length of a way along the surface: three and a half times the radius within which the network looks."""
+_LONGEST = 2.8
+"""The longest way along the surface of a body that is not folded up: people who stand have 2.4 to 2.8, with arms at
+their sides up to 3.4, animals 2.1 to 2.9 (docs/results/parts.md)."""
 
 
 _ELSEWHERE = (1.0, np.sqrt(2), np.sqrt(3))
@@ -91,7 +94,8 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     """Return the surface of one mesh.
 
     A cell is what edges join within a cube of a grid; vertices at one place are one, as at the seams of textures. Ways
-    are measured between the middles of cells, so that noise of vertices hardly makes them longer.
+    are measured between the middles of cells, so that noise of vertices hardly makes them longer. A body that is folded
+    up fills a small box: it is as large as the longest way along its surface says.
 
     Parameters
     ----------
@@ -103,19 +107,29 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     vertices = np.asarray(vertices, np.float64)
     _, first, point_of = np.unique(vertices @ _ELSEWHERE, return_index=True, return_inverse=True)
     placed, edges = np.nan_to_num(bounding_box(vertices).normalise(vertices[first])), point_of[edges]
-    found = next((found for size in _CUBES if (found := _Cells.of(placed, edges, size)).count <= _MOST_CELLS), None)
+    found = _Cells.few(placed, edges)
+    if found is not None and (folded := found.longest_way / _LONGEST) > 1:
+        found = _Cells.few(placed / folded, edges)
     cells = np.zeros(len(placed), np.int64) if found is None else found.cells
-    near = np.ones((1, 1), np.bool_) if found is None else found.near(placed)
+    near = np.ones((1, 1), np.bool_) if found is None else found.near
     return Surface(torch.from_numpy(cells[point_of])[None], torch.from_numpy(near)[None])
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """The cell [n] of each point; edges [e, 2] between cells; the piece [cell] that each belongs to, -1: crumbs."""
+    """The cell [n] of each point; ways [cell, cell] between neighbours; the piece [cell] that each belongs to, -1:
+    crumbs.
+    """
 
     cells: NDArray[np.int64]
-    edges: NDArray[np.int64]
+    ways: csr_array
     pieces: NDArray[np.int64]
+
+    @classmethod
+    def few(cls, placed: NDArray[np.float64], edges: NDArray[np.integer]) -> _Cells | None:
+        """The smallest that are few enough; None: there are too many."""
+        each = (cls.of(placed, edges, size) for size in _CUBES)
+        return next((found for found in each if found.count <= _MOST_CELLS), None)
 
     @classmethod
     def of(cls, placed: NDArray[np.float64], edges: NDArray[np.integer], size: float) -> _Cells:
@@ -129,25 +143,35 @@ class _Cells:
         pieces = np.where((np.bincount(pieces, filled) < _CRUMB * len(placed))[pieces], -1, pieces)
         number = np.where(pieces < 0, -1, np.arange(len(filled)))
         kept, number = np.unique(number, return_inverse=True)
-        between = number[between]
-        return cls(number[cells], between[between[:, 0] != between[:, 1]], np.where(kept < 0, -1, pieces[kept]))
+        cells, between = number[cells], number[between]
+        one, other = between[between[:, 0] != between[:, 1]].T
+        middles = np.stack([np.bincount(cells, axis) for axis in placed.T], axis=1) / np.bincount(cells)[:, None]
+        lengths = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-9
+        ways = csr_array((lengths, (one, other)), (len(kept), len(kept)))
+        return cls(cells, ways, np.where(kept < 0, -1, pieces[kept]))
 
     @property
     def count(self) -> int:
         """How many there are."""
         return len(self.pieces)
 
-    def near(self, placed: NDArray[np.float64]) -> NDArray[np.bool_]:
+    @property
+    def longest_way(self) -> float:
+        """About how long the longest of the shortest ways is along the piece with most points; of crumbs none."""
+        points = np.bincount(self.pieces + 1, np.bincount(self.cells))[1:]
+        if not len(points):
+            return 0.0
+        start, longest = int(np.argmax(self.pieces == points.argmax())), 0.0
+        for _ in range(3):  # from one end to the other
+            reached = np.nan_to_num(dijkstra(self.ways, directed=False, indices=start), posinf=0)
+            start, longest = int(reached.argmax()), float(reached.max())
+        return longest
+
+    @property
+    def near(self) -> NDArray[np.bool_]:
         """Which cells [cell, cell] a way along the surface joins that is not long, or none at all."""
-        filled = np.bincount(self.cells)
-        middles = np.stack([np.bincount(self.cells, axis) for axis in placed.T], axis=1) / filled[:, None]
-        one, other = self.edges.T
-        lengths = np.linalg.norm(middles[one] - middles[other], axis=1) + 1e-9
-        graph = csr_array((lengths, (one, other)), (self.count, self.count))
-        ways = dijkstra(graph, directed=False, limit=_FAR)
-        return np.isfinite(ways) | (
-            self.pieces[:, None] != self.pieces
-        )  # so crumbs are near all: their piece is no other's
+        reached = np.isfinite(dijkstra(self.ways, directed=False, limit=_FAR))
+        return reached | (self.pieces[:, None] != self.pieces)  # so crumbs are near all: their piece is no other's
 
 
 def _joined_by(edges: NDArray[np.integer], count: int) -> NDArray[np.int64]:
