@@ -3,7 +3,7 @@
 Parts are joined as the network has them: bones that one pose joint turns are one part, as the fingers of a hand are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from datagen.common.errors import RecipeError
 from datagen.mesh.geometry import edges_of
 from datagen.mesh.rig import Rig, skinned
+from datagen.store import Dataset
 from training.data.batch import Batch
 from training.data.rigs.bodies_at_rest import BodiesAtRest
 from training.data.row_random import Purpose, RowRandom
@@ -28,6 +29,9 @@ from training.objectives.parts import Posed
 
 _OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 _OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
+
+_SURFACES, _FEWEST_SURFACES = 64, 4
+"""In how many poses surfaces are found: of all kinds of bodies together, and of each at least."""
 
 
 class RigTable:
@@ -62,16 +66,15 @@ class RigTable:
         self._chosen = torch.tensor([self._poses.index(name) for name in self._names], device=device)
         self._device, self._row = torch.device(device), dict[int, int]()
         weights, rest, at = list[Tensor](), list[Tensor](), list[NDArray[np.float32]]()
-        surfaces, triangles = list[Surface](), list[Triangles]()
+        first_of, triangles = list[int](), list[Triangles]()
         kinds, known = list[int](), dict[bytes, int]()
         for identity, rig, vertices in zip(bodies.identities, bodies.rigs, bodies.vertices, strict=True):
             its_weights, its_rest, its_joints = self._in_the_poses_rest(rig, vertices)
             kind = known.setdefault(its_weights.tobytes(), len(known))
             if kind == len(weights):
                 weights.append(torch.from_numpy(its_weights).to(device))
-                faces = dataset.faces(identity)
-                surfaces.append(surface_of(its_rest, edges_of(faces)))
-                triangles.append(Triangles(its_rest, faces, device=self._device))
+                first_of.append(identity)
+                triangles.append(Triangles(its_rest, dataset.faces(identity), device=self._device))
             kinds.append(kind)
             rest.append(torch.from_numpy(its_rest).to(device))
             at.append(its_joints)
@@ -82,6 +85,8 @@ class RigTable:
         self._of_weights = np.cumsum([0, *map(len, weights[:-1])])[kinds]
         self._of_rest = np.cumsum([0, *map(len, rest[:-1])])
         self._counts = np.array([len(its) for its in rest])
+        self._poses_seen = max(_FEWEST_SURFACES, _SURFACES // len(first_of))
+        surfaces = [surface for identity in first_of for surface in _surfaces(dataset, identity, self._poses_seen)]
         self._surfaces = joined(surfaces).to(device)
         self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
         self._joints = torch.from_numpy(np.stack(at)).to(device)
@@ -94,8 +99,8 @@ class RigTable:
         sources = self._of(triples[:, 0], of_sources, batch.source, batch.source_rows, of_source)
         targets = self._of(triples[:, 2], of_targets, batch.target, batch.target_rows, of_target)
         surfaces = (
-            self._surface(triples[:, 0], batch.source, batch.source_rows, of_source),
-            self._surface(triples[:, 2], batch.target, batch.target_rows, of_target),
+            self._surface(triples[:, :2], batch.source, batch.source_rows, of_source),
+            self._surface(triples[:, 2:], batch.target, batch.target_rows, of_target),
         )
         return replace(batch, posed=(sources, targets), surfaces=surfaces)
 
@@ -155,14 +160,15 @@ class RigTable:
 
     def _surface(
         self,
-        identities: NDArray[np.integer],
+        meshes: NDArray[np.integer],
         vertices: Tensor,
         rows: Tensor | None,
         points: SurfacePoints | None,
     ) -> Surface:
-        """The surfaces of meshes of these identities; a pose does not change what is near along them."""
-        kinds = sent(torch.tensor([self._kinds[row] for row in self._rows(identities)]), self._device)
-        cells, near = (each.index_select(0, kinds) for each in self._surfaces)
+        """The surfaces of meshes (identity, pose), as in one of the poses: a pose hardly changes what is near."""
+        kinds = np.array([self._kinds[row] for row in self._rows(meshes[:, 0])])
+        numbers = torch.from_numpy(kinds * self._poses_seen + meshes[:, 1] % self._poses_seen)
+        cells, near = (each.index_select(0, sent(numbers, self._device)) for each in self._surfaces)
         if points is not None:
             cells = cells.gather(1, points.corners[..., 0])
         return Surface(cells[:, : vertices.shape[1]], near) if rows is None else Surface(cells, near).at(rows)
@@ -238,6 +244,17 @@ class RigTable:
             part = int(self._parents[part])
         own = joints[drivers == self._names[part]]
         return (own if len(own) else joints[:1]).mean(axis=0)
+
+
+def _surfaces(dataset: Dataset, identity: int, count: int) -> Iterator[Surface]:
+    """The surfaces of an identity in some of its poses.
+
+    Which vertices share a cell differs from pose to pose: of one pose alone a network learns the cells by heart, and
+    reads what is in other poses, as all is that it is used for, less well (docs/results/parts.md).
+    """
+    poses, edges = dataset.grid.poses_of(identity), edges_of(dataset.faces(identity))
+    for vertices in dataset.vertices(identity, [poses[place % len(poses)] for place in range(count)]):
+        yield surface_of(vertices, edges)
 
 
 def _carried(posed: Tensor, vertices: Tensor, turns: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:

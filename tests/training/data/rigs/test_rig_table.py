@@ -75,6 +75,22 @@ def test_surfaces_are_of_the_vertices_that_a_step_takes(legs: Dataset) -> None:
     assert torch.equal(told.surfaces[1].near, whole[1].near)
 
 
+def test_surfaces_are_found_in_several_poses_lest_cells_be_learned_by_heart(legs: Dataset) -> None:
+    poses = legs.grid.poses_of(legs.identities("training")[0])
+    triples = np.array([[1, pose, 0, pose] for pose in poses])
+    batch = table_of(legs).posed(triples, open_bank(legs, legs.identities("training")).batch(triples))
+    assert batch.surfaces is not None
+    source, target = batch.surfaces
+    assert torch.equal(source.cells, target.cells)  # of one kind of body
+    edges, found = edges_of(legs.faces(0)), list[torch.Tensor]()
+    for place, pose in enumerate(poses):
+        own = surface_of(legs.vertices(0, poses[pose % 64 % len(poses)]), edges)
+        assert torch.equal(source.cells[place], own.cells[0])
+        assert torch.equal(source.near[place, : own.near.shape[1], : own.near.shape[2]], own.near[0])
+        found.append(own.cells)
+    assert not all(torch.equal(found[0], other) for other in found)
+
+
 def test_bodies_rest_at_their_root_in_their_own_size(legs: Dataset) -> None:
     batch = table_of(legs).posed(TRIPLES, open_bank(legs, legs.identities("training")).batch(TRIPLES))
     assert batch.posed is not None
