@@ -17,8 +17,8 @@ from training.networks.parts import Parts, Reading, boxed
 
 _REST, _WEIGHTS, _ROTATIONS, _JOINTS = 5.0, 0.1, 0.12, 0.04
 _SMALL_TURN, _SMALL_STEP = 0.05, 0.005
-"""Of rotations and joints, distances up to which they count as their squares do, larger ones as themselves. Squares
-alone would learn from the hardest poses, a crouch weighing as much as twenty bodies that stand.
+"""Of rotations (Frobenius' norm; two degrees) and joints (half the longest edge of the box being 1), distances up to
+which they count as their squares do, larger ones as themselves: by squares alone the hardest poses would count most.
 """
 
 

@@ -30,8 +30,8 @@ from training.objectives.parts import Posed
 _OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 _OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
 
-_SURFACES, _FEWEST_SURFACES = 64, 4
-"""In how many poses surfaces are found: of all kinds of bodies together, and of each at least."""
+_SURFACES = 64
+"""In so many poses surfaces are found, of all kinds of bodies together; of more kinds in one pose each."""
 
 
 class RigTable:
@@ -85,7 +85,8 @@ class RigTable:
         self._of_weights = np.cumsum([0, *map(len, weights[:-1])])[kinds]
         self._of_rest = np.cumsum([0, *map(len, rest[:-1])])
         self._counts = np.array([len(its) for its in rest])
-        self._poses_seen = max(_FEWEST_SURFACES, _SURFACES // len(first_of))
+        fewest = min(len(dataset.grid.poses_of(identity)) for identity in first_of)
+        self._poses_seen = max(1, min(_SURFACES // len(first_of), fewest))
         surfaces = [surface for identity in first_of for surface in _surfaces(dataset, identity, self._poses_seen)]
         self._surfaces = joined(surfaces).to(device)
         self._present = torch.stack([(weights[kind] > 0).any(dim=0).float() for kind in kinds])
@@ -167,8 +168,8 @@ class RigTable:
     ) -> Surface:
         """The surfaces of meshes (identity, pose), as in one of the poses: a pose hardly changes what is near."""
         kinds = np.array([self._kinds[row] for row in self._rows(meshes[:, 0])])
-        numbers = torch.from_numpy(kinds * self._poses_seen + meshes[:, 1] % self._poses_seen)
-        cells, near = (each.index_select(0, sent(numbers, self._device)) for each in self._surfaces)
+        numbers = sent(torch.from_numpy(kinds * self._poses_seen + meshes[:, 1] % self._poses_seen), self._device)
+        cells, near = (each.index_select(0, numbers) for each in self._surfaces)
         if points is not None:
             cells = cells.gather(1, points.corners[..., 0])
         return Surface(cells[:, : vertices.shape[1]], near) if rows is None else Surface(cells, near).at(rows)
@@ -247,13 +248,13 @@ class RigTable:
 
 
 def _surfaces(dataset: Dataset, identity: int, count: int) -> Iterator[Surface]:
-    """The surfaces of an identity in some of its poses.
+    """The surfaces of an identity in so many of its poses.
 
-    Which vertices share a cell differs from pose to pose: of one pose alone a network learns the cells by heart, and
-    reads what is in other poses, as all is that it is used for, less well (docs/results/parts.md).
+    Which vertices share a cell differs from pose to pose: told those of one pose alone, a network learns the cells by
+    heart, and reads bodies less well that are told their own (docs/results/parts.md).
     """
     poses, edges = dataset.grid.poses_of(identity), edges_of(dataset.faces(identity))
-    for vertices in dataset.vertices(identity, [poses[place % len(poses)] for place in range(count)]):
+    for vertices in dataset.vertices(identity, [poses[place * len(poses) // count] for place in range(count)]):
         yield surface_of(vertices, edges)
 
 

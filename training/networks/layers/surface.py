@@ -22,16 +22,17 @@ from datagen.common.arrays import Floats
 from datagen.mesh.geometry import bounding_box
 
 _CUBES = (0.1, 0.125, 0.16, 0.2)
-"""Edges of the grid's cubes, half the longest edge of a mesh' box being 1: the first that gives few enough cells. Where
-none does, as in hair, all is near all."""
+"""Edges of the grid's cubes, half the longest edge of a mesh' box being 1, or of that of the body unfolded: the first
+that gives few enough cells. Where none does, as in hair, all is near all."""
 _MOST_CELLS = 1000
 _CRUMB = 0.01
 """Of the vertices: a piece with fewer is near to all, lest triangles that share no vertices be cells each."""
 _FAR = 0.35
-"""Length of a way along the surface: three and a half times the radius within which the network looks."""
-_LONGEST = 2.8
-"""The longest way along the surface of a body that is not folded up: people who stand have 2.4 to 2.8, with arms at
-their sides up to 3.4, animals 2.1 to 2.9 (docs/results/parts.md)."""
+"""Length of a way along the surface, in that unit: three and a half times the radius within which the network looks at
+bodies that are not folded up."""
+_LONGEST, _MOST_FOLDED = 2.8, 2.0
+"""The longest way along the surface of an ordinary body, in half the longest edge of its box: people and animals have
+2.1 to 3.2. What has more is measured as if its box were larger, up to so many times (docs/results/parts.md)."""
 
 
 _ELSEWHERE = (1.0, np.sqrt(2), np.sqrt(3))
@@ -95,7 +96,8 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
 
     A cell is what edges join within a cube of a grid; vertices at one place are one, as at the seams of textures. Ways
     are measured between the middles of cells, so that noise of vertices hardly makes them longer. A body that is folded
-    up fills a small box: it is as large as the longest way along its surface says.
+    up fills a small box: it is as large as the longest way along its surface says, along that of the piece with most
+    points where there are several.
 
     Parameters
     ----------
@@ -108,10 +110,10 @@ def surface_of(vertices: Floats, edges: NDArray[np.integer]) -> Surface:
     _, first, point_of = np.unique(vertices @ _ELSEWHERE, return_index=True, return_inverse=True)
     placed, edges = np.nan_to_num(bounding_box(vertices).normalise(vertices[first])), point_of[edges]
     found = _Cells.few(placed, edges)
-    if found is not None and (folded := found.longest_way / _LONGEST) > 1:
+    if found is not None and (folded := min(found.longest_way() / _LONGEST, _MOST_FOLDED)) > 1:
         found = _Cells.few(placed / folded, edges)
     cells = np.zeros(len(placed), np.int64) if found is None else found.cells
-    near = np.ones((1, 1), np.bool_) if found is None else found.near
+    near = np.ones((1, 1), np.bool_) if found is None else found.near()
     return Surface(torch.from_numpy(cells[point_of])[None], torch.from_numpy(near)[None])
 
 
@@ -155,7 +157,6 @@ class _Cells:
         """How many there are."""
         return len(self.pieces)
 
-    @property
     def longest_way(self) -> float:
         """About how long the longest of the shortest ways is along the piece with most points; of crumbs none."""
         points = np.bincount(self.pieces + 1, np.bincount(self.cells))[1:]
@@ -167,7 +168,6 @@ class _Cells:
             start, longest = int(reached.argmax()), float(reached.max())
         return longest
 
-    @property
     def near(self) -> NDArray[np.bool_]:
         """Which cells [cell, cell] a way along the surface joins that is not long, or none at all."""
         reached = np.isfinite(dijkstra(self.ways, directed=False, limit=_FAR))

@@ -1,5 +1,6 @@
 """What the parts network is told is what the dataset's rigs say, however a batch was turned and thinned."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from datagen.mesh.rig import world_rotations
 from datagen.store import Dataset, open_dataset
 from tests.support.recipes import LEG, PARTS, tiny_training
 from training.data.augmentation.augment import Augmentation
+from training.data.rigs import rig_table
 from training.data.rigs.bodies_at_rest import BodiesAtRest
 from training.data.rigs.rig_table import RigTable
 from training.data.vertex_bank import open_bank
@@ -75,20 +77,29 @@ def test_surfaces_are_of_the_vertices_that_a_step_takes(legs: Dataset) -> None:
     assert torch.equal(told.surfaces[1].near, whole[1].near)
 
 
-def test_surfaces_are_found_in_several_poses_lest_cells_be_learned_by_heart(legs: Dataset) -> None:
-    poses = legs.grid.poses_of(legs.identities("training")[0])
-    triples = np.array([[1, pose, 0, pose] for pose in poses])
-    batch = table_of(legs).posed(triples, open_bank(legs, legs.identities("training")).batch(triples))
-    assert batch.surfaces is not None
-    source, target = batch.surfaces
-    assert torch.equal(source.cells, target.cells)  # of one kind of body
-    edges, found = edges_of(legs.faces(0)), list[torch.Tensor]()
-    for place, pose in enumerate(poses):
-        own = surface_of(legs.vertices(0, poses[pose % 64 % len(poses)]), edges)
-        assert torch.equal(source.cells[place], own.cells[0])
-        assert torch.equal(source.near[place, : own.near.shape[1], : own.near.shape[2]], own.near[0])
-        found.append(own.cells)
-    assert not all(torch.equal(found[0], other) for other in found)
+def test_surfaces_are_of_each_kind_of_body_in_several_poses(legs: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lest cells be learned by heart. Of two kinds, as the second identity's weights differ, and three poses each."""
+    monkeypatch.setattr(rig_table, "_SURFACES", 6)
+    bodies = BodiesAtRest(legs, legs.identities("training"))
+    bodies.rigs[1] = replace(bodies.rigs[1], weights=bodies.rigs[1].weights[::-1].copy())
+    poses, edges = legs.grid.poses_of(0), edges_of(legs.faces(0))
+    triples = np.array([[place % 3, pose, (place + 1) % 3, poses[place - 2]] for place, pose in enumerate(poses)])
+    batch = open_bank(legs, legs.identities("training")).batch(triples)
+    table = RigTable(bodies, LEG, device="cpu")
+    for number in range(6):  # three of the first identity, three of the second
+        own = surface_of(legs.vertices(number // 3, poses[number % 3 * len(poses) // 3]), edges)
+        size = own.near.shape[1]
+        assert torch.equal(table._surfaces.cells[number], own.cells[0])
+        assert torch.equal(table._surfaces.near[number, :size, :size], own.near[0])
+    assert len({tuple(cells) for cells in table._surfaces.cells.tolist()}) > 1
+    table._surfaces.cells[:] = torch.arange(6)[:, None]
+    told = table.posed(triples, batch)
+    assert told.surfaces is not None
+    for surface, meshes in zip(told.surfaces, (triples[:, :2], triples[:, 2:]), strict=True):
+        expected = [3 * (identity == 1) + pose % 3 for identity, pose in meshes.tolist()]
+        assert surface.cells[:, 0].tolist() == expected
+    monkeypatch.setattr(rig_table, "_SURFACES", 1)
+    assert len(RigTable(bodies, LEG, device="cpu")._surfaces.cells) == 2  # of each kind at least
 
 
 def test_bodies_rest_at_their_root_in_their_own_size(legs: Dataset) -> None:

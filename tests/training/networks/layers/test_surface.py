@@ -13,7 +13,7 @@ from training.inference.mesh_reading import surfaces_of
 from training.networks import parts
 from training.networks.layers import sampling
 from training.networks.layers.sampling import Sample, sample
-from training.networks.layers.surface import Surface, joined, of_cells, surface_of
+from training.networks.layers.surface import Surface, _Cells, joined, of_cells, surface_of
 from training.networks.parts import Parts
 
 
@@ -174,17 +174,17 @@ def test_a_mesh_of_a_batch_is_told_what_it_is_told_alone() -> None:
 
 
 def test_what_is_folded_up_is_as_large_as_it_is_long_along_the_surface() -> None:
-    """A strip of 4 x 1, flat or in four layers: near is what 0.35 of its size joins, two if flat, folded 4.1 / 2.8."""
-    across, along = np.linspace(0, 1, 21), np.linspace(0, 4, 81)
-    layer = np.minimum(along // 1, 3)
+    """A strip of 2 x 1, flat or in two layers: near is what 0.35 of its size joins, one if flat, folded 2.1 / 2.8."""
+    across, along = np.linspace(0, 1, 21), np.linspace(0, 2, 41)
+    layer = np.minimum(along // 1, 1)
     there = along - layer
     flat, folded = (
-        np.concatenate([np.repeat(np.stack(places, axis=1), 21, axis=0), np.tile(across, 81)[:, None]], axis=1)
+        np.concatenate([np.repeat(np.stack(places, axis=1), 21, axis=0), np.tile(across, 41)[:, None]], axis=1)
         for places in ((along, 0 * along), (np.where(layer % 2, 1 - there, there), 0.15 * layer))
     )
-    corner = (np.arange(80)[:, None] * 21 + np.arange(20)).ravel()[:, None]
+    corner = (np.arange(40)[:, None] * 21 + np.arange(20)).ravel()[:, None]
     edges = edges_of(np.concatenate([corner + np.array(corners) for corners in ((0, 1, 21), (1, 22, 21))]))
-    middle = np.arange(10, 81 * 21, 21)
+    middle = np.arange(10, 41 * 21, 21)
 
     def reach(vertices: np.ndarray, order: np.ndarray) -> float:
         """How far along the strip what is near reaches to either side, in the mean."""
@@ -192,12 +192,33 @@ def test_what_is_folded_up_is_as_large_as_it_is_long_along_the_surface() -> None
         cells, between = surface_of(vertices[order], back[edges])
         of_middle = cells[0, back[middle]]
         is_near = between[0][of_middle][:, of_middle].numpy()
-        return float(np.mean([along[row].max() - along[row].min() for row in is_near[20:60]])) / 2
+        return float(np.mean([along[row].max() - along[row].min() for row in is_near[10:30]])) / 2
 
     as_listed, shuffled = np.arange(len(flat)), np.random.default_rng(0).permutation(len(flat))
-    assert 0.6 < reach(flat, as_listed) < 0.85
-    assert 0.4 < reach(folded, as_listed) < 0.65
+    assert 0.28 < reach(flat, as_listed) < 0.42
+    assert 0.22 < reach(folded, as_listed) < 0.32  # by its box alone 0.15 to 0.2
     assert reach(folded, shuffled) == reach(folded, as_listed)
+
+
+def test_the_longest_way_is_found_from_the_middle_and_counts_only_so_much() -> None:
+    """A long coil beside a plate: both are told apart, though a way along the coil is fifteen times the box' half."""
+    turn = np.linspace(0, 30, 4000)
+    coil = np.stack([0.5 * np.cos(turn), turn / 30, 0.5 * np.sin(turn)], axis=1)
+    line = np.stack([np.arange(3999), np.arange(1, 4000)], axis=1)
+    plate = np.stack([*np.meshgrid(np.linspace(-1, 1, 30), [0.0], np.linspace(-1, 1, 30), indexing="ij")], axis=-1)
+    number = np.arange(900).reshape(30, 30)
+    grid = [
+        np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ((number[1:], number[:-1]), (number.T[1:], number.T[:-1]))
+    ]
+    vertices = np.concatenate([coil, plate.reshape(-1, 3) - (0, 0.2, 0)])
+    cells, between = surface_of(vertices, np.concatenate([line, *(edges + 4000 for edges in grid)]))
+    of_plate = cells[0, 4000:]
+    assert len(set(of_plate.tolist())) > 20  # 400 cubes of 0.1 without the coil, 100 of twice that
+    assert between[0][of_plate][:, of_plate].float().mean() < 0.5
+    found = _Cells.of(coil, line, 0.1)
+    middle_first = _Cells.of(np.roll(coil, 2000, axis=0), (line + 2000) % 4000, 0.1)
+    assert found.longest_way() == pytest.approx(15, rel=0.1)
+    assert middle_first.longest_way() == pytest.approx(found.longest_way(), rel=0.02)
 
 
 def test_surfaces_of_several_meshes_are_padded() -> None:
