@@ -160,7 +160,8 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
 
     Where parts touch, as a hand does a hip, vertices alone are misunderstood. So a mesh that stands upright, faces
     ahead and has a rest error of at most `SURELY_READ` as it is, stays so, unasked for other ways; one that is misread
-    as it is, is turned by quarters about the vertical, where that makes the rest error clearly less. Of a mesh for
+    as it is, or in the way that was found, is turned by quarters about the vertical, where that makes the rest error
+    clearly less. Of a mesh for
     which another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a
     rest error of at most 1.25 times the other way's, stays so.
     """
@@ -180,17 +181,18 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     aside = _facing(_read(network, Mesh(found.turned(mesh.vertices), mesh.faces))[1])
     if abs(aside) > _STRAIGHT and np.array_equal(found.lean, eye):
         return _by(network, mesh, _about_vertical(-aside) @ found.matrix)
-    return replace(found, rest_error=error)
+    return _quarter_turned(network, mesh, replace(found, rest_error=error))
 
 
-def _quarter_turned(network: Parts, mesh: Mesh, as_it_is: Standing) -> Standing:
-    """How a mesh stands that no other way was found for: as it is, or, if that is misread, a clearer quarter turn."""
-    if as_it_is.rest_error <= MISREAD:
-        return as_it_is
-    best = min((_by(network, mesh, _about_vertical(angle)) for angle in _QUARTERS), key=lambda way: way.rest_error)
-    if _CLEARLY * best.rest_error < as_it_is.rest_error:
+def _quarter_turned(network: Parts, mesh: Mesh, found: Standing) -> Standing:
+    """How a mesh stands, as found or, if it is misread so and does not lean, a clearer quarter turn from there."""
+    if found.rest_error <= MISREAD or not np.array_equal(found.lean, np.eye(3)):
+        return found
+    ways = (_by(network, mesh, _about_vertical(angle) @ found.matrix) for angle in _QUARTERS)
+    best = min(ways, key=lambda way: way.rest_error)
+    if _CLEARLY * best.rest_error < found.rest_error:
         return best
-    return replace(as_it_is, rest_error=rest_error(network, mesh))
+    return replace(found, rest_error=rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces)))
 
 
 def _by(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:

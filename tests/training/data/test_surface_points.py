@@ -38,10 +38,10 @@ def legs(dataset: str) -> Dataset:
     return open_dataset(dataset)
 
 
-def surface_of_topology(legs: Dataset, identity: int) -> torch.Tensor:
-    """The cell of each vertex."""
+def surface_of_topology(legs: Dataset, identity: int, pose: int) -> torch.Tensor:
+    """The cell of each vertex, as training has it in that pose."""
     rigs = RigTable(BodiesAtRest(legs, legs.identities("training")), LEG, device="cpu")
-    triples = np.array([[identity, 0, identity, 0]])
+    triples = np.array([[identity, pose, identity, pose]])
     batch = rigs.posed(triples, open_bank(legs, legs.identities("training")).batch(triples))
     assert batch.surfaces is not None
     return batch.surfaces[0].cells[0]
@@ -131,7 +131,7 @@ def test_rigs_say_of_points_what_they_say_around_them(legs: Dataset) -> None:
             if side < 2:
                 rig = legs.rig(identity)
                 assert rig is not None
-                cells = surface_of_topology(legs, identity)[points.corners[row, rows[row], 0]]
+                cells = surface_of_topology(legs, identity, pose)[points.corners[row, rows[row], 0]]
                 assert torch.equal(batch.surfaces[side].cells[row], cells), "that of the nearest corner"
                 weights = (torch.from_numpy(rig.weights).float()[corners] * shares).sum(dim=1)
                 torch.testing.assert_close(batch.posed[side].weights[row], weights, rtol=0, atol=1e-5)

@@ -268,7 +268,7 @@ def test_a_facing_is_undone_from_9_degrees_on_and_of_a_body_that_leans_from_18(
 
 
 @pytest.mark.parametrize(
-    ("as_it_is", "facing_by", "stays"), [(4.6, 0, True), (4.7, 8, True), (4.6, 30, False), (4.9, 0, False)]
+    ("as_it_is", "facing_by", "stays"), [(4.7, 0, True), (4.9, 8, True), (4.7, 30, False), (5.1, 0, False)]
 )
 def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
     monkeypatch: pytest.MonkeyPatch, as_it_is: float, facing_by: float, stays: bool
