@@ -161,9 +161,8 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     Where parts touch, as a hand does a hip, vertices alone are misunderstood. So a mesh that stands upright, faces
     ahead and has a rest error of at most `SURELY_READ` as it is, stays so, unasked for other ways; one that is misread
     as it is, or in the way that was found, is turned by quarters about the vertical, where that makes the rest error
-    clearly less. Of a mesh for
-    which another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a
-    rest error of at most 1.25 times the other way's, stays so.
+    clearly less. Of a mesh for which another way was found, the facing is corrected; but one that is read to face
+    straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so.
     """
     understand, eye = understanding_of(network), np.eye(3)
     seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
@@ -172,7 +171,10 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
         return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
     found = standing(understand, mesh.vertices)
     if np.array_equal(found.matrix, eye) and np.array_equal(found.lean, eye):
-        return found if np.isnan(as_it_is) else _quarter_turned(network, mesh, replace(found, rest_error=as_it_is))
+        if np.isnan(as_it_is) or as_it_is <= MISREAD:
+            return replace(found, rest_error=as_it_is)
+        clearer = _clearer_quarter(network, mesh, replace(found, rest_error=as_it_is))
+        return clearer or replace(found, rest_error=rest_error(network, mesh))
     error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
     if np.isnan(as_it_is):
         as_it_is, root = _read(network, mesh)
@@ -181,18 +183,16 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     aside = _facing(_read(network, Mesh(found.turned(mesh.vertices), mesh.faces))[1])
     if abs(aside) > _STRAIGHT and np.array_equal(found.lean, eye):
         return _by(network, mesh, _about_vertical(-aside) @ found.matrix)
-    return _quarter_turned(network, mesh, replace(found, rest_error=error))
+    found = replace(found, rest_error=error)
+    is_to_turn = error > MISREAD and np.array_equal(found.lean, eye)
+    return (_clearer_quarter(network, mesh, found) if is_to_turn else None) or found
 
 
-def _quarter_turned(network: Parts, mesh: Mesh, found: Standing) -> Standing:
-    """How a mesh stands, as found or, if it is misread so and does not lean, a clearer quarter turn from there."""
-    if found.rest_error <= MISREAD or not np.array_equal(found.lean, np.eye(3)):
-        return found
+def _clearer_quarter(network: Parts, mesh: Mesh, found: Standing) -> Standing | None:
+    """The quarter turn about the vertical of a mesh in the way found with clearly less rest error, if there is one."""
     ways = (_by(network, mesh, _about_vertical(angle) @ found.matrix) for angle in _QUARTERS)
     best = min(ways, key=lambda way: way.rest_error)
-    if _CLEARLY * best.rest_error < found.rest_error:
-        return best
-    return replace(found, rest_error=rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces)))
+    return best if _CLEARLY * best.rest_error < found.rest_error else None
 
 
 def _by(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:

@@ -104,4 +104,5 @@ def _compared(reading: Reading, right: Posed) -> dict[str, Tensor]:
 
 
 def _distance(squared: Tensor, small: float) -> Tensor:
+    """Distances [...] by their squares [...]; below ``small`` they grow as squares do (Charbonnier et al. 1994)."""
     return (squared + small**2).sqrt() - small
