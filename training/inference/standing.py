@@ -122,12 +122,15 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         of a mesh that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave
         less misfit, so that it stays so where that is in doubt.
     """
-    points = _probe(mesh)
-    ways = at_first = _Ways(understand, points, _VERTICES)
-    as_it_is = ways.seen([np.eye(3)])[0]
-    if as_it_is.misfit > KNOWN and len(points) > _VERTICES:
-        at_first = _Ways(understand, points, _MORE_VERTICES)
-        as_it_is = at_first.seen([np.eye(3)])[0]
+    ways = _Ways(understand, _probe(mesh), _VERTICES)
+    return _standing(ways, ways.seen([np.eye(3)])[0])
+
+
+def _standing(ways: "_Ways", as_it_is: "_Seen") -> Standing:
+    """`standing`, of a mesh that was seen as it is."""
+    at_first = ways
+    if as_it_is.misfit > KNOWN and (more := ways.by_more()):
+        at_first, as_it_is = more, more.seen([np.eye(3)])[0]
     if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
         return at_first.faced(as_it_is).stands if as_it_is.is_aside else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
@@ -156,20 +159,23 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
 
 
 def stands(network: Parts, mesh: Mesh) -> Standing:
-    """Find how a mesh stands (`standing`), told its surface where it is not well understood as it is.
+    """Find how a mesh stands (`standing`), told its surface where vertices alone leave a doubt.
 
-    Where parts touch, as a hand does a hip, vertices alone are misunderstood. So a mesh that stands upright, faces
-    ahead and has a rest error of at most `SURELY_READ` as it is, stays so, unasked for other ways; one that is misread
+    Where parts touch, as a hand does a hip, vertices alone are misunderstood, and facing is read off them less well. So
+    one that is not well understood as it is, or faces aside, is read with its surface; where it stands upright, faces
+    ahead and has a rest error of at most `SURELY_READ` then, it stays so, unasked for other ways. One that is misread
     as it is, or in the way that was found, is turned by quarters about the vertical, where that makes the rest error
     clearly less. Of a mesh for which another way was found, the facing is corrected; but one that is read to face
     straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so.
     """
-    understand, eye = understanding_of(network), np.eye(3)
-    seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
-    as_it_is, root = _read(network, mesh) if seen.misfit > KNOWN else (np.nan, seen.root)
+    eye = np.eye(3)
+    ways = _Ways(understanding_of(network), _probe(mesh.vertices), _VERTICES)
+    seen = ways.seen([eye])[0]
+    in_doubt = seen.misfit > KNOWN or seen.is_aside
+    as_it_is, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
     if as_it_is <= SURELY_READ and abs(_facing(root)) <= _STRAIGHT and _leaning(root) <= _UPRIGHT:
         return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
-    found = standing(understand, mesh.vertices)
+    found = _standing(ways, seen)
     if np.array_equal(found.matrix, eye) and np.array_equal(found.lean, eye):
         if np.isnan(as_it_is) or as_it_is <= MISREAD:
             return replace(found, rest_error=as_it_is)
@@ -286,6 +292,10 @@ class _Ways:
 
     def __init__(self, understand: Understanding, points: Floats, vertices: int) -> None:
         self._understand, self._points, self._vertices = understand, points, vertices
+
+    def by_more(self) -> "_Ways | None":
+        """The same by more vertices, where the mesh has any."""
+        return _Ways(self._understand, self._points, _MORE_VERTICES) if len(self._points) > self._vertices else None
 
     def seen(self, ways: Sequence[NDArray[np.float64]], vertices: int | None = None) -> list[_Seen]:
         read = vertices or self._vertices
