@@ -96,4 +96,4 @@ def _world_rotations(network: Parts, meshes: Iterable[Mesh]) -> Iterator[NDArray
                 f"mesh {number} is no body whose pose these weights know (misread by {error:.0f} degrees, more than "
                 f"{MISREAD:g}). Look at it, or leave it out"
             )
-        yield turn @ reading.rotations[0].double().numpy()
+        yield turn @ network.read_again(drawn, reading).rotations[0].double().numpy()

@@ -25,6 +25,7 @@ from training.networks.layers.modulation import full_precision
 from training.networks.layers.rigid_parts import (
     ancestors,
     box,
+    halved,
     matrices,
     mirrored,
     moved_joints,
@@ -38,10 +39,6 @@ from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
-_SURELY_CORRECTED = 0.1
-"""Sum of squares over the rotations' numbers up to which a correction is taken unread, as it was better each time that
-it was read (docs/results/parts.md).
-"""
 _LEAST_NEAR = 0.07
 """Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part
 (docs/results/parts.md)."""
@@ -158,8 +155,9 @@ class Parts(nn.Module):
     ) -> Tensor:
         """Return ``[b, n_target, 3]`` in a box of its own for ``[b, n_source, 3]`` and ``[b, n_target, 3]``.
 
-        Outside of training mode the output is read in its turn: errors in reading that source and output share, being
-        in one pose, cancel in the correction. A large one is read once more, and not taken where it is no better.
+        Outside of training mode every mesh is read again at rest (`read_again`), and the output is read in its turn:
+        errors in reading that source and output share, being in one pose, cancel in the correction. Half of it is
+        taken, as it has errors of its own.
 
         Parameters
         ----------
@@ -185,14 +183,19 @@ class Parts(nn.Module):
     ) -> ReadTarget:
         """Return what is read off targets [b, n, 3] in their normalised boxes: once for any number of sources.
 
+        Rotations and joints are read again at rest, and so are the logits of a mesh that is its own sample.
+
         ``as_read``: where their vertices are to be read, without noise, say; by default where they are.
         """
         read = target if as_read is None else as_read
         check_pair(target, read, self.lift.weight.dtype)
         with full_precision(target):
             drawn = sample(read, surface)
-            logits, _, rotations, joints = self.read(drawn, read)
-            return ReadTarget(target, read, drawn, _weights(logits, drawn), rotations, joints)
+            of_all = self.read(drawn, read)
+            found = self.read_again(drawn, of_all._replace(logits=taken(of_all.logits, drawn.rows)))
+            is_its_sample = drawn.rows.shape == of_all.logits.shape[:2]
+            logits = taken(found.logits, drawn.rows.argsort(dim=1)) if is_its_sample else of_all.logits
+            return ReadTarget(target, read, drawn, _weights(logits, drawn), found.rotations, found.joints)
 
     def posed_target(
         self,
@@ -237,6 +240,25 @@ class Parts(nn.Module):
             features = self._of_all(vertices, drawn, features, known)
             logits, rest = self.part(features), self.rest(features)
         return Reading(logits, rest, turns, joints)
+
+    def read_again(self, drawn: Sample, first: Reading) -> Reading:
+        """Return the mean of what was read of a sample, and of what is read where that poses it to rest.
+
+        Parts lie apart at rest, and what is read wrongly there is mostly something else. A joint lies on two parts:
+        what was missed of it is turned as the one and as the other, by halves. ``rest`` stays.
+        """
+        rotations, joints = first.rotations, first.joints
+        at_rest = moved_joints(joints, rotations.mT, self.parents, self.above)
+        posed = skinned(drawn.vertices, first.logits.softmax(2), rotations.mT, joints, at_rest)
+        middle, half = box(posed)
+        found = self.read(drawn.moved((posed - middle) / half))
+        missed = half * found.joints + middle - at_rest
+        both = (rotations + rotations[:, self.parents]) / 2
+        return first._replace(
+            logits=(first.logits + found.logits) / 2,
+            rotations=rotations @ halved(found.rotations),
+            joints=joints + (both @ missed[..., None])[..., 0] / 2,
+        )
 
     @torch.inference_mode()
     def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
@@ -302,11 +324,12 @@ class Parts(nn.Module):
         return boxed(skinned(vertices, weights, turns, joints, moved))
 
     def _rotations(self, drawn: Sample, twice: Tensor | None) -> Tensor:
-        """Rotations of the parts [b, part, 3, 3]; of some meshes [b] the mean of what two readings say."""
-        found = self.read(drawn).rotations
+        """Rotations of the parts [b, part, 3, 3]; of some meshes [b] the mean of what they and their images say."""
+        found = self.read_again(drawn, self.read(drawn)).rotations
         if twice is None or self.other_side is None:
             return found
-        of_image = mirrored(self.read(drawn.mirrored()).rotations[:, self.other_side])
+        image = drawn.mirrored()
+        of_image = mirrored(self.read_again(image, self.read(image)).rotations[:, self.other_side])
         both = nearest_rotations((found + of_image).flatten(0, 1)).view_as(found)
         return torch.where(twice[:, None, None, None], both, found)
 
@@ -317,26 +340,13 @@ class Parts(nn.Module):
         heard: Callable[[Tensor], Tensor] | None = None,
         twice: Tensor | None = None,
     ) -> Tensor:
+        """Targets' vertices [b, n, 3] by the rotations that are wanted, turned by half of what their outputs miss."""
         vertices, as_read, drawn, weights, own, joints = target
         turns = wanted @ own.mT
-
-        def posed(turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            output = self.posed(as_read, weights, joints, turns)
-            heard_of = output if heard is None else heard(output)
-            found = self._rotations(drawn.moved(taken(heard_of, drawn.rows)), twice)
-            return output, found, (wanted - found).square().sum((1, 2, 3))
-
-        output, found, missing = posed(turns)
-        corrected = wanted @ found.mT @ turns
-        is_better = missing <= _SURELY_CORRECTED
-        if output.is_cuda or torch.compiler.is_compiling() or not bool(is_better.all()):
-            better, _, left = posed(corrected)
-            is_better = is_better | (left <= missing)
-        else:
-            better = self.posed(as_read, weights, joints, corrected)
-        if as_read is vertices:
-            return torch.where(is_better[:, None, None], better, output)
-        return self.posed(vertices, weights, joints, torch.where(is_better[:, None, None, None], corrected, turns))
+        output = self.posed(as_read, weights, joints, turns)
+        heard_of = output if heard is None else heard(output)
+        found = self._rotations(drawn.moved(taken(heard_of, drawn.rows)), twice)
+        return self.posed(vertices, weights, joints, halved(wanted @ found.mT) @ turns)
 
     def _of_all(self, vertices: Tensor, drawn: Sample, features: Tensor, known: _OfSample) -> Tensor:
         """Features [b, n, width] of all vertices, those of the sample [b, k, width] being known."""

@@ -44,6 +44,19 @@ def turned_about(vectors: Tensor) -> Tensor:
     return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + turn * across + back * (across @ across)
 
 
+def halved(rotations: Tensor) -> Tensor:
+    """Return rotations [..., 3, 3] by half of their angles, which are below 180 degrees.
+
+    The unit quaternion of half of it lies midway between that of the rotation and that of none.
+    """
+    ahead = (1 + rotations.diagonal(dim1=-2, dim2=-1).sum(-1)).clamp_min(1e-12).sqrt() / 2  # cosine of half the angle
+    across = (rotations - rotations.mT) / (4 * ahead)[..., None, None]  # by the vector of the quaternion
+    ahead = 1 + ahead
+    norm = ahead.square() + across.square().sum((-2, -1)) / 2
+    none = torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+    return none + (2 / norm)[..., None, None] * (ahead[..., None, None] * across + across @ across)
+
+
 def nearest_rotations(spread: Tensor) -> Tensor:
     """Return the rotations [b, 3, 3] by which points p come nearest to points q; sum q p^T [b, 3, 3] (Kabsch 1976).
 
