@@ -104,7 +104,7 @@ class Standing:
         return vertices @ self.matrix
 
 
-def standing(understand: Understanding, mesh: Floats) -> Standing:
+def standing(understand: Understanding, mesh: Floats, seen: "_Seen | None" = None) -> Standing:
     """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
@@ -121,13 +121,11 @@ def standing(understand: Understanding, mesh: Floats) -> Standing:
         Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways, and to rule out the other quarter turns
         of a mesh that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave
         less misfit, so that it stays so where that is in doubt.
+    seen
+        How it is seen as it is, by 256, where that is known.
     """
     ways = _Ways(understand, _probe(mesh), _VERTICES)
-    return _standing(ways, ways.seen([np.eye(3)])[0])
-
-
-def _standing(ways: "_Ways", as_it_is: "_Seen") -> Standing:
-    """`standing`, of a mesh that was seen as it is."""
+    as_it_is = seen or ways.seen([np.eye(3)])[0]
     at_first = ways
     if as_it_is.misfit > KNOWN and (more := ways.by_more()):
         at_first, as_it_is = more, more.seen([np.eye(3)])[0]
@@ -168,14 +166,13 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     clearly less. Of a mesh for which another way was found, the facing is corrected; but one that is read to face
     straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so.
     """
-    eye = np.eye(3)
-    ways = _Ways(understanding_of(network), _probe(mesh.vertices), _VERTICES)
-    seen = ways.seen([eye])[0]
+    understand, eye = understanding_of(network), np.eye(3)
+    seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
     in_doubt = seen.misfit > KNOWN or seen.is_aside
     as_it_is, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
     if as_it_is <= SURELY_READ and abs(_facing(root)) <= _STRAIGHT and _leaning(root) <= _UPRIGHT:
         return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
-    found = _standing(ways, seen)
+    found = standing(understand, mesh.vertices, seen)
     if np.array_equal(found.matrix, eye) and np.array_equal(found.lean, eye):
         if np.isnan(as_it_is) or as_it_is <= MISREAD:
             return replace(found, rest_error=as_it_is)

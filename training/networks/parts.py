@@ -9,6 +9,8 @@ surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is 
 
     read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
 
+Outside of training each mesh is read twice, as it is and at rest, and so is the output, by which turns are corrected.
+
 No scale is taken from the source, so that missing vertices of it do not matter to the size of the output.
 """
 
@@ -247,18 +249,23 @@ class Parts(nn.Module):
         Parts lie apart at rest, and what is read wrongly there is mostly something else. A joint lies on two parts:
         what was missed of it is turned as the one and as the other, by halves. ``rest`` stays.
         """
-        rotations, joints = first.rotations, first.joints
-        at_rest = moved_joints(joints, rotations.mT, self.parents, self.above)
-        posed = skinned(drawn.vertices, first.logits.softmax(2), rotations.mT, joints, at_rest)
-        middle, half = box(posed)
-        found = self.read(drawn.moved((posed - middle) / half))
-        missed = half * found.joints + middle - at_rest
+        found, missed = self._at_rest(drawn, first)
+        rotations = first.rotations
         both = (rotations + rotations[:, self.parents]) / 2
         return first._replace(
             logits=(first.logits + found.logits) / 2,
             rotations=rotations @ halved(found.rotations),
-            joints=joints + (both @ missed[..., None])[..., 0] / 2,
+            joints=first.joints + (both @ missed[..., None])[..., 0] / 2,
         )
+
+    def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
+        """What is read of a sample that a reading poses to rest, and by how much [b, part, 3] joints are missed there."""
+        joints, back = reading.joints, reading.rotations.mT
+        at_rest = moved_joints(joints, back, self.parents, self.above)
+        posed = skinned(drawn.vertices, reading.logits.softmax(2), back, joints, at_rest)
+        middle, half = box(posed)
+        found = self.read(drawn.moved((posed - middle) / half))
+        return found, half * found.joints + middle - at_rest
 
     @torch.inference_mode()
     def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
@@ -291,13 +298,12 @@ class Parts(nn.Module):
         degrees, whatever it wears; what is no body makes another mesh at rest than the network took it for.
         """
         with full_precision(drawn.vertices):
-            at_rest = self.posed(drawn.vertices, reading.logits.softmax(2), reading.joints, reading.rotations.mT)
-            found = self.read(drawn.moved(at_rest)).rotations
+            found = self._at_rest(drawn, reading)[0].rotations
             cosine = (found.diagonal(dim1=2, dim2=3).sum(2) - 1) / 2
             return torch.rad2deg(cosine.clamp(-1, 1).acos()).square().mean(1).sqrt()
 
     def skinning_weights(self, drawn: Sample, vertices: Tensor) -> Tensor:
-        """Return the weights [b, n, part] by which the vertices [b, n, 3] of meshes with such a sample are posed."""
+        """Return weights [b, n, part] of vertices [b, n, 3] of meshes with such a sample, as they are first read."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
         return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn)
@@ -337,8 +343,8 @@ class Parts(nn.Module):
         self,
         wanted: Tensor,
         target: ReadTarget,
-        heard: Callable[[Tensor], Tensor] | None = None,
-        twice: Tensor | None = None,
+        heard: Callable[[Tensor], Tensor] | None,
+        twice: Tensor | None,
     ) -> Tensor:
         """Targets' vertices [b, n, 3] by the rotations that are wanted, turned by half of what their outputs miss."""
         vertices, as_read, drawn, weights, own, joints = target

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -13,6 +14,7 @@ from datagen.mesh.rig import world_rotations
 from datagen.poses import PARENTS, Poses, draw_poses
 from datagen.recipe import AnnyBody, PoseRecipe
 from training.inference.pose_reading import local_rotations, read_poses
+from training.networks.parts import Parts
 from workflows.pretrained import own_weights
 
 
@@ -56,6 +58,16 @@ def test_the_pose_of_a_person_is_read() -> None:
         ).max()
         < 12
     ), "a vertex in no face is not read"
+
+
+def test_poses_are_what_is_read_again_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, poses = load_body(AnnyBody(topology="notoes_collapse5pc")), draw_poses(PoseRecipe(seed=7), range(1))
+    who = body.draw_identity(generator(7, Stream.IDENTITY, 0), 0)
+    mesh = Mesh(body.vertices(who, poses)[0], body.faces(who))
+    monkeypatch.setattr(
+        Parts, "read_again", lambda _, drawn, first: first._replace(rotations=torch.eye(3).expand_as(first.rotations))
+    )
+    np.testing.assert_allclose(read_poses([own_weights("human")], [mesh]).rotations, 0, atol=1e-6)
 
 
 def test_what_is_no_person_and_weights_that_read_no_poses_are_refused() -> None:

@@ -275,7 +275,7 @@ def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
 ) -> None:
     root = Rotation.from_euler("y", facing_by, degrees=True).as_matrix()
     round_about = Standing(Rotation.from_euler("y", 180, degrees=True).as_matrix(), 0.001)
-    monkeypatch.setattr(module, "_standing", lambda *_: round_about)
+    monkeypatch.setattr(module, "standing", lambda *_: round_about)
     monkeypatch.setattr(module, "rest_error", lambda *_: 4.0)
     body = Mesh(BODY, np.empty((0, 3), np.int64))
     monkeypatch.setattr(module, "_read", lambda _, mesh: (as_it_is, root) if mesh is body else (4.0, np.eye(3)))
@@ -285,15 +285,32 @@ def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
     assert found.rest_error == (as_it_is if stays else 4.0) and (found.root is root) == stays
 
 
-@pytest.mark.parametrize(("aside", "surely", "asked"), [(8, True, True), (12, True, False), (12, False, True)])
-def test_a_body_that_vertices_face_aside_and_its_surface_surely_ahead_is_asked_for_no_other_way(
-    monkeypatch: pytest.MonkeyPatch, aside: float, surely: bool, asked: bool
+@pytest.mark.parametrize(
+    ("misfit", "aside", "surely", "surface", "asked"),
+    [
+        (0.001, 8, True, [0, 0], True),  # no doubt, so that its surface is not read
+        (0.001, 12, True, [0, 0], False),
+        (0.003, 0, True, [0, 0], False),
+        (0.001, 12, False, [0, 0], True),
+        (0.001, 12, True, [12, 0], True),
+        (0.001, 12, True, [0, 15], True),
+    ],
+)
+def test_a_body_in_doubt_whose_surface_is_surely_read_upright_and_ahead_is_asked_for_no_other_way(
+    monkeypatch: pytest.MonkeyPatch, misfit: float, aside: float, surely: bool, surface: list[float], asked: bool
 ) -> None:
-    root = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None]
-    monkeypatch.setattr(module, "understanding_of", lambda _: lambda meshes: (np.full(len(meshes), 0.001), root))
-    monkeypatch.setattr(module, "_read", lambda *_: (module.SURELY_READ if surely else 6.0, np.eye(3)))
-    others = list[bool]()
-    monkeypatch.setattr(module, "_standing", lambda _, seen: others.append(True) or seen.stands)
+    root, read = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None], list[int]()
+
+    def understood(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        read.append(len(meshes))
+        return np.full(len(meshes), misfit), root
+
+    of_surface = Rotation.from_euler("YX", surface, degrees=True).as_matrix()
+    others = list[object]()
+    monkeypatch.setattr(module, "understanding_of", lambda _: understood)
+    monkeypatch.setattr(module, "_read", lambda *_: (module.SURELY_READ if surely else 6.0, of_surface))
+    monkeypatch.setattr(module, "standing", lambda *given: others.append(given[2].root) or given[2].stands)
     found = module.stands(lively("parts"), Mesh(BODY, np.empty((0, 3), np.int64)))
     assert np.array_equal(found.matrix, np.eye(3)) and bool(others) == asked
-    assert np.isnan(found.rest_error) == (aside == 8), "its surface is read where there is a doubt"
+    assert np.isnan(found.rest_error) == (aside == 8)
+    assert read == [1] and all(np.array_equal(each, root[0]) for each in others), "what was seen is handed on"

@@ -169,7 +169,7 @@ def test_the_sources_order_changes_nothing(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in ALL if plain(name) != "corenet3d"])
 def test_the_targets_order_is_that_of_the_output(name: str) -> None:
     """3D-CoreNet reads neighbours in the list; NPT's origin pairs source and target, which are ordered together."""
-    network, inputs, order = network_of(name), pair_of(name), torch.randperm(27)
+    network, inputs, order = network_of(name).eval(), pair_of(name), torch.randperm(27)
     source = inputs["source"][:, order] if plain(name) == PAIRING else inputs["source"]
     moved = network(source=source, target=inputs["target"][:, order])
     torch.testing.assert_close(moved, network(**inputs)[:, order], rtol=0, atol=1e-12)
