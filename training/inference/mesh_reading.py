@@ -3,10 +3,11 @@
 A parts network poses the vertices of a mesh as they are, but reads rough ones, which have noise, through a low-pass
 filter along the edges (:mod:`datagen.mesh.low_pass`). Outputs of people that are as finely meshed as their sources are
 then compared with these through the same filter, so that what it does to a body is no difference. Filtered people, and
-people of points, are read as their mirror images, too (animals' rigs are not alike on both sides). Of a source of points up to 2,048 are read, of a mesh 1,024 vertices; a source that lists the vertices of its target in the
-same order is read at those at which the target is. A transfer reads its meshes so, and what measures transfers of
-single meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands,
-whether it is a body, in which pose an avatar is to be, or onto which parts an output is projected.
+people of points, are read as their mirror images, too (animals' rigs are not alike on both sides). Of a source of
+points up to 2,048 are read, of a mesh 1,024 vertices; a source that lists the vertices of its target in the same order
+is read at those at which the target is. A transfer reads its meshes so, and what measures transfers of single meshes.
+Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body,
+in which pose an avatar is to be, or onto which parts an output is projected.
 """
 
 from collections.abc import Sequence

@@ -259,7 +259,7 @@ class Parts(nn.Module):
         )
 
     def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
-        """What is read of a sample that a reading poses to rest, and by how much [b, part, 3] joints are missed there."""
+        """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
         joints, back = reading.joints, reading.rotations.mT
         at_rest = moved_joints(joints, back, self.parents, self.above)
         posed = skinned(drawn.vertices, reading.logits.softmax(2), back, joints, at_rest)
