@@ -331,11 +331,14 @@ class Parts(nn.Module):
 
     def _rotations(self, drawn: Sample, twice: Tensor | None) -> Tensor:
         """Rotations of the parts [b, part, 3, 3]; of some meshes [b] the mean of what they and their images say."""
-        found = self.read_again(drawn, self.read(drawn)).rotations
+
+        def read(some: Sample) -> Tensor:
+            return self.read_again(some, self.read(some)).rotations
+
+        found = read(drawn)
         if twice is None or self.other_side is None:
             return found
-        image = drawn.mirrored()
-        of_image = mirrored(self.read_again(image, self.read(image)).rotations[:, self.other_side])
+        of_image = mirrored(read(drawn.mirrored())[:, self.other_side])
         both = nearest_rotations((found + of_image).flatten(0, 1)).view_as(found)
         return torch.where(twice[:, None, None, None], both, found)
 
