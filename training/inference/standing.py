@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from datagen.common.arrays import Floats
@@ -53,15 +54,16 @@ _STRAIGHT = np.radians(9.0)  # a facing that may be an error of the network's ow
 _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error of the network's own
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
-_SURELY = 2.0, 6.0  # times less by a few vertices, of a mesh that is understood twice as well as it must be, of others
+_SURELY = 6.0  # times less than that of another way by a few vertices, which leave more: no need to read it by others
 _NEARLY = 1.25  # times the rest error of another way: as well read
 _SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
 _MORE_VERTICES = 512  # read of a mesh that is not understood as it is by fewer
-_FIRST_VERTICES, _KEPT = 48, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
+_FIRST_VERTICES, _KEPT = 64, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
+_AROUND = 9  # itself and eight others: the area around a vertex grows as the square of how far these are
 _SIDES = 6  # of a box: directions along the axes
-_QUARTERS = np.radians([90.0, 180.0, 270.0])
+_QUARTER_TURNS, _KEPT_TURNS = Rotation.create_group("O").as_matrix()[1:], 6  # about all axes; read with the surface
 _TURNS = 3
 _TILTS = np.radians([16.0, 8.0, 4.0])  # about any axis, tried after the best of all ways is known
 _ANGLES = np.radians(np.arange(0.0, 360.0, 30.0))
@@ -118,9 +120,9 @@ def standing(understand: Understanding, mesh: Floats, seen: "_Seen | None" = Non
     Parameters
     ----------
     mesh
-        Vertices [n, 3] in any unit; 256 of them are read, 48 to rank many ways, and to rule out the other quarter turns
-        of a mesh that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave
-        less misfit, so that it stays so where that is in doubt.
+        Vertices [n, 3] in any unit; 256 of them are read, 64 to rank many ways, and to rule out turns aside of a mesh
+        that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave less
+        misfit, so that it stays so where that is in doubt.
     seen
         How it is seen as it is, by 256, where that is known.
     """
@@ -129,7 +131,7 @@ def standing(understand: Understanding, mesh: Floats, seen: "_Seen | None" = Non
     at_first = ways
     if as_it_is.misfit > KNOWN and (more := ways.by_more()):
         at_first, as_it_is = more, more.seen([np.eye(3)])[0]
-    if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is, [_about_vertical(angle) for angle in _QUARTERS]):
+    if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is):
         return at_first.faced(as_it_is).stands if as_it_is.is_aside else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
     understood = best.misfit <= KNOWN and _CLEARLY * best.misfit < as_it_is.misfit
@@ -161,47 +163,70 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
 
     Where parts touch, as a hand does a hip, vertices alone are misunderstood, and facing is read off them less well. So
     one that is not well understood as it is, or faces aside, is read with its surface; where it stands upright, faces
-    ahead and has a rest error of at most `SURELY_READ` then, it stays so, unasked for other ways. One that is misread
-    as it is, or in the way that was found, is turned by quarters about the vertical, where that makes the rest error
-    clearly less. Of a mesh for which another way was found, the facing is corrected; but one that is read to face
-    straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so.
+    ahead and has a rest error of at most `SURELY_READ` then, it stays so, unasked for other ways. Of a mesh for which
+    another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a rest
+    error of at most 1.25 times the other way's, stays so. One that is misread even then is turned by quarters about all
+    axes, where that makes the rest error clearly less.
     """
     understand, eye = understanding_of(network), np.eye(3)
     seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
     in_doubt = seen.misfit > KNOWN or seen.is_aside
-    as_it_is, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
-    if as_it_is <= SURELY_READ and abs(_facing(root)) <= _STRAIGHT and _leaning(root) <= _UPRIGHT:
-        return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
+    error, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
+    stays = Standing(eye, seen.misfit, rest_error=error, root=root)
+    if error <= SURELY_READ and _is_straight(root) and _leaning(root) <= _UPRIGHT:
+        return stays
     found = standing(understand, mesh.vertices, seen)
-    if np.array_equal(found.matrix, eye) and np.array_equal(found.lean, eye):
-        if np.isnan(as_it_is) or as_it_is <= MISREAD:
-            return replace(found, rest_error=as_it_is)
-        clearer = _clearer_quarter(network, mesh, replace(found, rest_error=as_it_is))
-        return clearer or replace(found, rest_error=rest_error(network, mesh))
+    leans = not np.array_equal(found.lean, eye)
+    if leans or not np.array_equal(found.matrix, eye):
+        found = _rather(network, mesh, found, stays)
+    else:
+        found = replace(found, rest_error=error)
+    if leans or not found.rest_error > MISREAD:
+        return found
+    turned = Mesh(found.turned(mesh.vertices), mesh.faces)
+    return _clearer_turn(network, mesh, found) or replace(found, rest_error=rest_error(network, turned))
+
+
+def _rather(network: Parts, mesh: Mesh, found: Standing, stays: Standing) -> Standing:
+    """The way found for a mesh, facing ahead, or that it stays as it is, where its surface is read as well then."""
     error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
-    if np.isnan(as_it_is):
+    if np.isnan(stays.rest_error):
         as_it_is, root = _read(network, mesh)
-    if as_it_is <= _NEARLY * error and abs(_facing(root)) <= _STRAIGHT:
-        return Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
-    aside = _facing(_read(network, Mesh(found.turned(mesh.vertices), mesh.faces))[1])
-    if abs(aside) > _STRAIGHT and np.array_equal(found.lean, eye):
-        return _by(network, mesh, _about_vertical(-aside) @ found.matrix)
-    found = replace(found, rest_error=error)
-    is_to_turn = error > MISREAD and np.array_equal(found.lean, eye)
-    return (_clearer_quarter(network, mesh, found) if is_to_turn else None) or found
+        stays = replace(stays, rest_error=as_it_is, root=root)
+    assert stays.root is not None
+    if stays.rest_error <= _NEARLY * error and _is_straight(stays.root):
+        return stays
+    return replace(found, rest_error=error) if (found.lean != np.eye(3)).any() else _faced(network, mesh, found.matrix)
 
 
-def _clearer_quarter(network: Parts, mesh: Mesh, found: Standing) -> Standing | None:
-    """The quarter turn about the vertical of a mesh in the way found with clearly less rest error, if there is one."""
-    ways = (_by(network, mesh, _about_vertical(angle) @ found.matrix) for angle in _QUARTERS)
-    best = min(ways, key=lambda way: way.rest_error)
-    return best if _CLEARLY * best.rest_error < found.rest_error else None
+def _faced(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
+    """A mesh in this way [3, 3], turned about the vertical until its surface is read to face ahead."""
+    found = _by(network, mesh, way)
+    for _ in range(_TURNS):
+        assert found.root is not None
+        if _is_straight(found.root):
+            break
+        ahead = _by(network, mesh, _about_vertical(-_facing(found.root)) @ found.matrix)
+        if ahead.rest_error > _NEARLY * found.rest_error:
+            break
+        found = ahead
+    return found
+
+
+def _clearer_turn(network: Parts, mesh: Mesh, found: Standing) -> Standing | None:
+    """The turn by quarters of a mesh in the way found with clearly less rest error, if there is one."""
+    understand = understanding_of(network)
+    turned = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([turn @ found.matrix for turn in _QUARTER_TURNS])
+    likely = sorted(turned, key=lambda turn: turn.misfit)[:_KEPT_TURNS]
+    best = min((_by(network, mesh, turn.way) for turn in likely), key=lambda turn: turn.rest_error)
+    return _faced(network, mesh, best.matrix) if _CLEARLY * best.rest_error < found.rest_error else None
 
 
 def _by(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
     """A mesh turned in this way [3, 3], its surface read."""
     turned = Mesh(mesh.vertices @ way.T, mesh.faces)
-    return Standing(way, misfit(understanding_of(network), turned.vertices), rest_error=_read(network, turned)[0])
+    error, root = _read(network, turned)
+    return Standing(way, misfit(understanding_of(network), turned.vertices), rest_error=error, root=root)
 
 
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64] | Standing) -> NDArray[np.float64]:
@@ -299,12 +324,16 @@ class _Ways:
         misfits, roots = self._understand(np.stack([_boxed(self._points @ way.T, read) for way in ways]))
         return [_Seen(way, float(m), root) for way, m, root in zip(ways, misfits, roots, strict=True)]
 
-    def none_is_clearer(self, seen: _Seen, others: Sequence[NDArray[np.float64]]) -> bool:
-        """Whether none of the other ways is clearly better understood; a few vertices tell where that is plain."""
-        surely = _SURELY[seen.misfit > KNOWN / 2]
-        if all(surely * seen.misfit <= other.misfit for other in self.seen(others, _FIRST_VERTICES)):
-            return True
-        return all(seen.misfit <= _CLEARLY * other.misfit for other in self.seen(others))
+    def none_is_clearer(self, seen: _Seen) -> bool:
+        """Whether turned by quarters about the vertical the mesh, seen as it is, is clearly better understood nowhere.
+
+        Of aside a few vertices tell where it is plain; from behind a body that raises its hands looks much the same.
+        """
+        behind, aside = _about_vertical(np.pi), [_about_vertical(angle) for angle in (-np.pi / 2, np.pi / 2)]
+        others = self.seen([behind])
+        if not all(_SURELY * seen.misfit <= other.misfit for other in self.seen(aside, _FIRST_VERTICES)):
+            others += self.seen(aside)
+        return all(seen.misfit <= _CLEARLY * other.misfit for other in others)
 
     def best_of(self, ranked: Sequence[_Seen]) -> _Seen:
         """The way with the least misfit of those that a few vertices rank first."""
@@ -328,6 +357,10 @@ class _Ways:
         """The way turned about the vertical until the body faces +Z; left where that is misread, as where it leans."""
         ahead = self.ahead(found)
         return ahead if ahead.misfit <= max(KNOWN, found.misfit) else found
+
+
+def _is_straight(root: NDArray[np.float64]) -> bool:
+    return abs(_facing(root)) <= _STRAIGHT
 
 
 def _facing(root: NDArray[np.float64]) -> float:
@@ -356,8 +389,15 @@ def _turn(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 
 
 def _probe(mesh: Floats) -> Floats:
-    """Some vertices, the same each time, whatever lies first in the file."""
-    return mesh[np.random.default_rng(0).permutation(len(mesh))[:_LOOKED_AT]]
+    """Some vertices, the same each time, however it is turned and whatever lies first in the file.
+
+    The first of them lie evenly on the surface: they are drawn one after another, each by the area around it
+    (Efraimidis and Spirakis 2006), so that finely meshed hands do not stand for a body.
+    """
+    random = np.random.default_rng(0)
+    some = mesh[random.permutation(len(mesh))[:_LOOKED_AT]]
+    away = cKDTree(some).query(some, k=[min(_AROUND, len(some))])[0][:, 0]
+    return some[np.argsort(random.exponential(size=len(some)) / np.maximum(np.square(away), 1e-30))]
 
 
 def _boxed(probe: Floats, vertices: int = _VERTICES) -> Floats:

@@ -66,17 +66,17 @@ def test_everyday_poses_are_taken(human: PoseTransfer, pose: str) -> None:
     assert pmd(posed[None], target(pose).vertices[None]) < 0.0008
 
 
-@pytest.mark.parametrize("pose", ["hands on hips", "cross-legged", "on one leg"])
+@pytest.mark.parametrize("pose", ["hands on hips", "cross-legged", "on one leg", "hands up", "hugging the knees"])
 @pytest.mark.parametrize("way", [("y", 0), ("y", 180), ("x", -90)])
 def test_people_who_fold_their_limbs_are_found_to_stand_as_they_do(
     human: PoseTransfer, pose: str, way: tuple[str, float]
 ) -> None:
-    """Of whom vertices alone are misunderstood: their surface decides."""
+    """Whom vertices alone misunderstand, so that their surface decides, or who look much the same from behind."""
     mesh, turn = Person(0.55, "notoes_collapse10pc", 3)(pose), Rotation.from_euler(*way, degrees=True)
     found = human.standing(Mesh(turn.apply(mesh.vertices), mesh.faces))
     assert isinstance(found, Standing)
     left = Rotation.from_matrix(found.lean.T @ found.matrix) * turn
-    assert np.degrees(left.magnitude()) < 15
+    assert np.degrees(left.magnitude()) < 20
 
 
 def test_what_is_read_of_a_body_that_is_not_dense_is_most_of_it() -> None:

@@ -5,16 +5,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from datagen.mesh.geometry import Mesh
+from datagen.mesh.geometry import Mesh, bounding_box
 from tests.support.three_networks import lively
 from training.inference import standing as module
 from training.inference.standing import Standing, facing, misfit, standing
 
 RANDOM = np.random.default_rng(3)
-BODY = RANDOM.normal(size=(60, 3)) * (0.3, 1, 0.2)
-ORDER = np.random.default_rng(0).permutation(60)  # as its vertices are drawn
+BODY = RANDOM.normal(size=(80, 3)) * (0.3, 1, 0.2)
+
+
+def drawn(mesh: NDArray[np.floating]) -> NDArray[np.intp]:
+    """The numbers of a mesh' vertices, as they are drawn."""
+    seen = list[NDArray[np.floating]]()
+
+    def watched(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        seen.extend(meshes)
+        return np.zeros(1), np.eye(3)[None]
+
+    misfit(watched, mesh)
+    return cdist(seen[0], bounding_box(mesh).normalise(mesh)).argmin(axis=1)
+
+
+ORDER = drawn(BODY)
 
 
 def turns_of(meshes: NDArray[np.floating]) -> list[Rotation]:
@@ -60,33 +75,31 @@ def test_an_upright_body_is_left_exactly_as_it_is() -> None:
     assert np.array_equal(standing(understand, slightly).matrix, np.eye(3)), "it may be an error of the network's own"
 
 
-@pytest.mark.parametrize(("by_more", "facing_by"), [(0.0005, 0), (0.0005, 9), (0.0030, 0)])
+@pytest.mark.parametrize(("by_more", "facing_by"), [(0.0005, 0), (0.0005, 10), (0.0030, 0)])
 def test_a_mesh_that_few_vertices_do_not_understand_as_it_is_is_read_by_more_before_it_is_turned(
     by_more: float, facing_by: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A lean that few vertices like better is not taken: the mesh is understood as it is, or that is in doubt."""
-    for name, count in {"_FIRST_VERTICES": 20, "_VERTICES": 30, "_MORE_VERTICES": 60}.items():
+    for name, count in {"_FIRST_VERTICES": 20, "_VERTICES": 30, "_MORE_VERTICES": 80}.items():
         monkeypatch.setattr(f"training.inference.standing.{name}", count)
     lean, read = Rotation.from_euler("x", 28, degrees=True), list[int]()
 
     def confused(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         read.append(meshes.shape[1])
         misfits, roots = understand(meshes)
-        if meshes.shape[1] == 60:
+        if meshes.shape[1] == 80:
             return misfits - 0.0005 + by_more, roots
         leaning = np.array([(turn * lean.inv()).magnitude() for turn in turns_of(meshes)])
         return 0.0025 + 0.02 * (1 - np.cos(leaning)), roots
 
     turn = Rotation.from_euler("y", facing_by, degrees=True)
     found = standing(confused, turn.apply(BODY))
-    assert read[:2] == [30, 60] and (30 in read[2:]) == (by_more > 0.002)
+    assert read[:2] == [30, 80] and (30 in read[2:]) == (by_more > 0.002)
     assert np.degrees((Rotation.from_matrix(found.matrix) * turn).magnitude()) < 2
     assert np.array_equal(found.lean, np.eye(3))
 
 
-@pytest.mark.parametrize(
-    ("own", "times", "enough"), [(0.0005, 2.2, True), (0.0005, 1.8, False), (0.0015, 6.2, True), (0.0015, 5.8, False)]
-)
+@pytest.mark.parametrize(("own", "times", "enough"), [(0.0005, 6.2, True), (0.0005, 5.8, False), (0.0015, 6.2, True)])
 def test_other_ways_are_read_well_only_where_a_few_vertices_leave_a_doubt(
     own: float, times: float, enough: bool
 ) -> None:
@@ -99,7 +112,7 @@ def test_other_ways_are_read_well_only_where_a_few_vertices_leave_a_doubt(
 
     found = standing(watched, BODY)
     assert np.array_equal(found.matrix, np.eye(3))
-    assert read == [(1, 60), (3, 48), (3, 60)][: 2 if enough else 3]
+    assert read == [(1, 80), (1, 80), (2, 64), (2, 80)][: 3 if enough else 4], "of aside; what is behind is read well"
 
 
 @pytest.mark.parametrize("angle", [30, 60, 89, 90, 120, 180, 271])
@@ -161,6 +174,16 @@ def test_a_body_that_was_just_found_to_stand_is_not_read_again_to_see_whether_it
     assert np.allclose(facing(watched, upright, found), facing(understand, upright, found.lean)) and not read
     facing(watched, upright, replace(found, root=None))
     assert read == [1], "of one that somebody else says how it stands"
+
+
+def test_vertices_that_lie_closely_do_not_stand_for_the_body() -> None:
+    """Half of the vertices are a hand's; hardly any of the first that are read are, however the body is turned."""
+    hand = RANDOM.normal(size=(80, 3)) * 0.005 + (0.5, 0.5, 0)
+    body = np.concatenate([BODY, hand])
+    first = drawn(body)[:60]
+    assert np.sum(first >= len(BODY)) < 6
+    turned = Rotation.from_euler("yx", [30, 60], degrees=True).apply(body) * 40 + 7
+    assert np.array_equal(drawn(turned)[:60], first)
 
 
 @pytest.mark.parametrize("angle", [-170, -95, -30, 10, 47, 120, 180])
