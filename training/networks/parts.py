@@ -88,6 +88,25 @@ class ReadTarget(NamedTuple):
     joints: Tensor
 
 
+class AtRest(NamedTuple):
+    """Meshes that a reading posed to rest (:meth:`Parts.posed_to_rest`).
+
+    Attributes
+    ----------
+    vertices
+        [b, n, 3], in boxes of their own.
+    joints
+        Where the joints that were read [b, part, 3] went, before those boxes were taken.
+    middle, half
+        Of the boxes, [b, 1, 3] and [b, 1, 1].
+    """
+
+    vertices: Tensor
+    joints: Tensor
+    middle: Tensor
+    half: Tensor
+
+
 class Parts(nn.Module):
     """The parts network.
 
@@ -260,12 +279,17 @@ class Parts(nn.Module):
 
     def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
+        rest = self.posed_to_rest(drawn.vertices, reading)
+        found = self.read(drawn.moved(rest.vertices))
+        return found, rest.half * found.joints + rest.middle - rest.joints
+
+    def posed_to_rest(self, vertices: Tensor, reading: Reading) -> AtRest:
+        """Return meshes [b, n, 3] as what was read of each of their vertices poses them to rest."""
         joints, back = reading.joints, reading.rotations.mT
         at_rest = moved_joints(joints, back, self.parents, self.above)
-        posed = skinned(drawn.vertices, reading.logits.softmax(2), back, joints, at_rest)
+        posed = skinned(vertices, reading.logits.softmax(2), back, joints, at_rest)
         middle, half = box(posed)
-        found = self.read(drawn.moved((posed - middle) / half))
-        return found, half * found.joints + middle - at_rest
+        return AtRest((posed - middle) / half, at_rest, middle, half)
 
     @torch.inference_mode()
     def understood(self, vertices: Tensor) -> tuple[Tensor, Tensor]:

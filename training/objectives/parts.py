@@ -63,12 +63,14 @@ def parts_loss(
     truth: Tensor,
     posed: tuple[Posed, Posed],
     surfaces: tuple[Surface, Surface] | None = None,
+    at_rest: bool = False,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the weighted loss and its parts, unweighted and detached.
 
     ``reconstruction`` is that of the papers, output and truth in boxes of the vertices that are there; the others are
     means over both meshes: ``weights``, the cross-entropy of a vertex's part; ``rest``, squared distances; ``rotation``
-    and ``joint``, distances that are smooth near zero (Charbonnier et al. 1994).
+    and ``joint``, distances that are smooth near zero (Charbonnier et al. 1994). ``at_rest`` is the weighted sum of
+    those four where the meshes are read again (`Parts.read_again`).
 
     Parameters
     ----------
@@ -78,20 +80,58 @@ def parts_loss(
         How the sources and the targets are posed.
     surfaces
         What is near along their surfaces; None: it is not told.
+    at_rest
+        Whether the meshes are read again, as what was read poses them to rest; no gradient reaches the first reading
+        by it.
     """
     with full_precision(source):
         readings = network.read_pair(source, target, surfaces)
         output = network.posed_like(target, readings)
     reconstruction = 3 * mse_loss(output, boxed(truth))
-    of_source, of_target = (_compared(reading, right) for reading, right in zip(readings, posed, strict=True))
-    named = {name: (value + of_target[name]) / 2 for name, value in of_source.items()}
-    loss = reconstruction + 2 * (
-        _REST * named["rest"] + _WEIGHTS * named["weights"] + _ROTATIONS * named["rotation"] + _JOINTS * named["joint"]
-    )
+    named = _compared(readings, posed)
+    loss = reconstruction + 2 * _weighted(named)
+    if at_rest:
+        meshes, posed = _posed_to_rest(network, (source, target), readings, posed)
+        with full_precision(source):
+            readings = network.read_pair(*meshes, surfaces)
+        named["at_rest"] = _weighted(_compared(readings, posed))
+        loss = loss + 2 * named["at_rest"]
     return loss, {name: value.detach() for name, value in {"reconstruction": reconstruction, **named}.items()}
 
 
-def _compared(reading: Reading, right: Posed) -> dict[str, Tensor]:
+@torch.no_grad()
+def _posed_to_rest(
+    network: Parts, meshes: tuple[Tensor, Tensor], readings: tuple[Reading, Reading], posed: tuple[Posed, Posed]
+) -> tuple[tuple[Tensor, Tensor], tuple[Posed, Posed]]:
+    """Both meshes [b, n, 3] as their readings pose them to rest, and how they are posed there.
+
+    What was read rightly is at rest then; a part that was misread is turned by what is missing. A joint lies on two
+    parts, and what was missed of it goes along with both, by halves.
+    """
+    found = list[tuple[Tensor, Posed]]()
+    for vertices, reading, right in zip(meshes, readings, posed, strict=True):
+        rest, back = network.posed_to_rest(vertices, reading), reading.rotations.mT
+        both = (back + back[:, network.parents]) / 2
+        joints = rest.joints + (both @ (right.joints - reading.joints)[..., None])[..., 0]
+        joints = (joints - rest.middle) / rest.half
+        found.append((rest.vertices, replace(right, rotations=back @ right.rotations, joints=joints)))
+    of_source, of_target = found
+    return (of_source[0], of_target[0]), (of_source[1], of_target[1])
+
+
+def _weighted(named: dict[str, Tensor]) -> Tensor:
+    return (
+        _REST * named["rest"] + _WEIGHTS * named["weights"] + _ROTATIONS * named["rotation"] + _JOINTS * named["joint"]
+    )
+
+
+def _compared(readings: tuple[Reading, Reading], posed: tuple[Posed, Posed]) -> dict[str, Tensor]:
+    """Means over both meshes."""
+    of_source, of_target = (_compared_with(right, reading) for reading, right in zip(readings, posed, strict=True))
+    return {name: (value + of_target[name]) / 2 for name, value in of_source.items()}
+
+
+def _compared_with(right: Posed, reading: Reading) -> dict[str, Tensor]:
     there = right.present / right.present.sum(1, keepdim=True)
     turned = (reading.rotations - right.rotations).square().sum((2, 3))
     away = (reading.joints - right.joints).square().sum(2)

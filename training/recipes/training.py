@@ -147,6 +147,11 @@ class AugmentationRecipe(Frozen):
         description="network parts: share of the sources, and of the targets, that are made of random points of their "
         "surfaces, even by area of the body at rest, in the place of vertices",
     )
+    at_rest: bool = Field(
+        False,
+        description="network parts: every mesh is given once more as its reading poses it to rest, where transfers "
+        "read it again; a step takes twice as long",
+    )
     recombined: float = Field(
         0.0,
         ge=0,
@@ -283,11 +288,11 @@ class TrainingRecipe(Frozen):
             )
         if subset and kept < 1:
             raise ValueError("augmentation.subset and augmentation.vertices both leave vertices out: take one away")
-        for name in ("proportions", "points"):
+        for name in ("proportions", "points", "at_rest"):
             if getattr(self.augmentation, name) and not isinstance(self.network, PartsRecipe):
                 raise ValueError(
                     f"augmentation.{name} needs the rigs that network 'parts' is told of, but the network is "
-                    f"{self.network.name!r}: set augmentation.{name} to 0"
+                    f"{self.network.name!r}: leave augmentation.{name} out"
                 )
         self._refuse_what_parts_does_not_know()
         self._refuse_what_avatars_do_not_know()

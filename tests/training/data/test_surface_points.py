@@ -243,6 +243,7 @@ def test_points_of_meshes_of_several_vertex_counts_are_turned_cut_and_thinned_li
         torch.testing.assert_close(centred[0] * (sizes[1] / sizes[0]), centred[1], rtol=0, atol=0.05)
 
 
-def test_points_are_for_the_network_that_learns_from_rigs() -> None:
-    with pytest.raises(ValueError, match=r"augmentation\.points needs .* set augmentation\.points to 0"):
-        tiny_training(augmentation={"points": 0.3})
+@pytest.mark.parametrize(("name", "value"), [("points", 0.3), ("proportions", 0.1), ("at_rest", True)])
+def test_what_needs_rigs_is_for_the_network_that_learns_from_them(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"augmentation\.{name} needs .* leave augmentation\.{name} out"):
+        tiny_training(augmentation={name: value})

@@ -54,7 +54,7 @@ CUTS = {
 def cut(name: str, **changes: Any) -> TrainingRecipe:
     given = {**TEN, "precision": CUTS[name][0], "average": 0.9, "network": NETWORKS[name.split(maxsplit=1)[0]]}
     if name == "parts":
-        given |= {"augmentation": PARTS["augmentation"], "optimiser": "muon"}
+        given |= {"augmentation": PARTS["augmentation"] | {"at_rest": True}, "optimiser": "muon"}
     return tiny_training(**given | changes)
 
 

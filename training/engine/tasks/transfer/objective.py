@@ -52,9 +52,9 @@ class TransferObjective(nn.Module):
 class PartsObjective(nn.Module):
     """The parts network: its output against the truth, and what it reads off both meshes against their rigs."""
 
-    def __init__(self, network: Parts) -> None:
+    def __init__(self, network: Parts, *, at_rest: bool = False) -> None:
         super().__init__()
-        self.network = network
+        self.network, self._at_rest = network, at_rest
 
     def forward(self, batch: Batch, *, step: int) -> Losses:
         """Return the losses of a batch that a :class:`training.data.rigs.rig_table.RigTable` was asked about."""
@@ -66,5 +66,6 @@ class PartsObjective(nn.Module):
             truth=batch.truth,
             posed=batch.posed,
             surfaces=batch.surfaces,
+            at_rest=self._at_rest,
         )
         return {**parts, "total": loss}

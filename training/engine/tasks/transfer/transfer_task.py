@@ -61,7 +61,7 @@ class TransferTask:
     def objective(self, network: nn.Module, device: torch.device) -> nn.Module:
         """See :class:`PartsObjective`, :class:`TransferObjective`."""
         if isinstance(network, Parts):
-            return PartsObjective(network)
+            return PartsObjective(network, at_rest=self._recipe.augmentation.at_rest)
         return TransferObjective(network, self._recipe, device)
 
     @contextmanager
