@@ -136,7 +136,8 @@ def main() -> None:
         other = names[(number + len(names) // 2) % len(names)]
         source = giver(name)
         stands = transfer.standing(source)
-        cells = [transfer.rest_error(Mesh(stands.upright(source.vertices), source.faces))]
+        upright = Mesh(stands.upright(source.vertices), source.faces)
+        cells = [transfer.rest_error(upright) if np.isnan(stands.rest_error) else stands.rest_error]
         for which, taker in enumerate(takers):
             case = Case(number, (0, 0, 0, 0), source, taker(other), taker(name))
             output = aligned(posed(transfer, case), case.truth.vertices)

@@ -55,15 +55,17 @@ _UPRIGHT = np.radians(12.0)  # a root leans so far for a pose, or for an error o
 _LEANS = np.radians(50.0)  # from Y, which is up in most files: a little more than half way to another axis
 _CLEARLY = 1.5  # times less is the misfit of another way to stand, where it is taken
 _SURELY = 6.0  # times less than that of another way by a few vertices, which leave more: no need to read it by others
-_NEARLY = 1.25  # times the rest error of another way: as well read
+_NEARLY = 1.25  # times the rest error of another way: as well read, or no worse
 _SETTLED = np.radians(1.0)  # a turn that is not worth another reading
 _MESHES_AT_ONCE = 16
 _LOOKED_AT, _VERTICES = 4096, 256  # of a mesh: to know its box, and to read
 _MORE_VERTICES = 512  # read of a mesh that is not understood as it is by fewer
 _FIRST_VERTICES, _KEPT = 64, 24  # read to rank many ways or to rule out some, and how many ranked are read well then
-_AROUND = 9  # itself and eight others: the area around a vertex grows as the square of how far these are
+_DRAWN = 1024  # of the vertices that are looked at, from which those that are read are drawn by area
+_AROUND, _FAR = 9, 3.0  # itself and eight others, whose distance tells the area; times the median of it at most
 _SIDES = 6  # of a box: directions along the axes
-_QUARTER_TURNS, _KEPT_TURNS = Rotation.create_group("O").as_matrix()[1:], 6  # about all axes; read with the surface
+_QUARTER_TURNS = [turn.as_matrix() for turn in Rotation.create_group("O") if turn.magnitude() > 0.1]  # about all axes
+_KEPT_TURNS = 6  # of these, read with the surface
 _TURNS = 3
 _TILTS = np.radians([16.0, 8.0, 4.0])  # about any axis, tried after the best of all ways is known
 _ANGLES = np.radians(np.arange(0.0, 360.0, 30.0))
@@ -92,6 +94,11 @@ class Standing:
     rest_error: float = np.nan
     lean: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     root: NDArray[np.float64] | None = None
+
+    @property
+    def leans(self) -> bool:
+        """Whether there is a lean."""
+        return not np.array_equal(self.lean, np.eye(3))
 
     def turned(self, vertices: Floats) -> Floats:
         """Vertices [..., 3] in the mesh' own axes -> Y up, facing +Z."""
@@ -165,26 +172,26 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     one that is not well understood as it is, or faces aside, is read with its surface; where it stands upright, faces
     ahead and has a rest error of at most `SURELY_READ` then, it stays so, unasked for other ways. Of a mesh for which
     another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a rest
-    error of at most 1.25 times the other way's, stays so. One that is misread even then is turned by quarters about all
-    axes, where that makes the rest error clearly less.
+    error of at most 1.25 times the other way's, stays so. One that is misread even then, and was not found to lean, is
+    turned by quarters about all axes, where that makes the rest error clearly less.
     """
     understand, eye = understanding_of(network), np.eye(3)
     seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
     in_doubt = seen.misfit > KNOWN or seen.is_aside
-    error, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
-    stays = Standing(eye, seen.misfit, rest_error=error, root=root)
-    if error <= SURELY_READ and _is_straight(root) and _leaning(root) <= _UPRIGHT:
+    as_it_is, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
+    stays = Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
+    if as_it_is <= SURELY_READ and _is_straight(root) and _leaning(root) <= _UPRIGHT:
         return stays
     found = standing(understand, mesh.vertices, seen)
-    leans = not np.array_equal(found.lean, eye)
-    if leans or not np.array_equal(found.matrix, eye):
+    if found.leans or not np.array_equal(found.matrix, eye):
         found = _rather(network, mesh, found, stays)
-    else:
-        found = replace(found, rest_error=error)
-    if leans or not found.rest_error > MISREAD:
+    elif in_doubt:
+        found = replace(found, rest_error=as_it_is, root=root)
+    if found.leans or not found.rest_error > MISREAD:
         return found
-    turned = Mesh(found.turned(mesh.vertices), mesh.faces)
-    return _clearer_turn(network, mesh, found) or replace(found, rest_error=rest_error(network, turned))
+    if clearer := _clearer_turn(network, mesh, found):
+        return clearer
+    return replace(found, rest_error=rest_error(network, Mesh(found.turned(mesh.vertices), mesh.faces)))
 
 
 def _rather(network: Parts, mesh: Mesh, found: Standing, stays: Standing) -> Standing:
@@ -196,7 +203,7 @@ def _rather(network: Parts, mesh: Mesh, found: Standing, stays: Standing) -> Sta
     assert stays.root is not None
     if stays.rest_error <= _NEARLY * error and _is_straight(stays.root):
         return stays
-    return replace(found, rest_error=error) if (found.lean != np.eye(3)).any() else _faced(network, mesh, found.matrix)
+    return replace(found, rest_error=error) if found.leans else _faced(network, mesh, found.matrix)
 
 
 def _faced(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
@@ -391,13 +398,17 @@ def _turn(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 def _probe(mesh: Floats) -> Floats:
     """Some vertices, the same each time, however it is turned and whatever lies first in the file.
 
-    The first of them lie evenly on the surface: they are drawn one after another, each by the area around it
-    (Efraimidis and Spirakis 2006), so that finely meshed hands do not stand for a body.
+    The first of them lie evenly on the surface, and are much the same in other poses: they are drawn one after another,
+    each by the area around it (Efraimidis and Spirakis 2006), so that finely meshed hands do not stand for a body. One
+    that lies far from all others counts as little more than the rest.
     """
     random = np.random.default_rng(0)
     some = mesh[random.permutation(len(mesh))[:_LOOKED_AT]]
-    away = cKDTree(some).query(some, k=[min(_AROUND, len(some))])[0][:, 0]
-    return some[np.argsort(random.exponential(size=len(some)) / np.maximum(np.square(away), 1e-30))]
+    drawn = np.nan_to_num(some[:_DRAWN], nan=0.0, posinf=0.0, neginf=0.0)
+    away = cKDTree(drawn).query(drawn, k=[min(_AROUND, len(drawn))])[0][:, 0]
+    areas = np.square(np.clip(away, 1e-15, max(_FAR * float(np.median(away)), 1e-15)))
+    order = np.argsort(random.exponential(size=len(drawn)) / areas)
+    return np.concatenate([some[order], some[_DRAWN:]])
 
 
 def _boxed(probe: Floats, vertices: int = _VERTICES) -> Floats:

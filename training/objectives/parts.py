@@ -65,7 +65,7 @@ def parts_loss(
     surfaces: tuple[Surface, Surface] | None = None,
     at_rest: bool = False,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the weighted loss and its parts, unweighted and detached.
+    """Return the weighted loss and its parts, detached, and unweighted but for ``at_rest``.
 
     ``reconstruction`` is that of the papers, output and truth in boxes of the vertices that are there; the others are
     means over both meshes: ``weights``, the cross-entropy of a vertex's part; ``rest``, squared distances; ``rotation``
@@ -82,7 +82,7 @@ def parts_loss(
         What is near along their surfaces; None: it is not told.
     at_rest
         Whether the meshes are read again, as what was read poses them to rest; no gradient reaches the first reading
-        by it.
+        by it. They are sampled anew there, which transfers do not do.
     """
     with full_precision(source):
         readings = network.read_pair(source, target, surfaces)
@@ -91,8 +91,8 @@ def parts_loss(
     named = _compared(readings, posed)
     loss = reconstruction + 2 * _weighted(named)
     if at_rest:
-        meshes, posed = _posed_to_rest(network, (source, target), readings, posed)
         with full_precision(source):
+            meshes, posed = _posed_to_rest(network, (source, target), readings, posed)
             readings = network.read_pair(*meshes, surfaces)
         named["at_rest"] = _weighted(_compared(readings, posed))
         loss = loss + 2 * named["at_rest"]
@@ -103,7 +103,7 @@ def parts_loss(
 def _posed_to_rest(
     network: Parts, meshes: tuple[Tensor, Tensor], readings: tuple[Reading, Reading], posed: tuple[Posed, Posed]
 ) -> tuple[tuple[Tensor, Tensor], tuple[Posed, Posed]]:
-    """Both meshes [b, n, 3] as their readings pose them to rest, and how they are posed there.
+    """Both meshes [b, n, 3] as their readings pose them to rest, and what of rotations and joints is missing there.
 
     What was read rightly is at rest then; a part that was misread is turned by what is missing. A joint lies on two
     parts, and what was missed of it goes along with both, by halves.
@@ -120,6 +120,7 @@ def _posed_to_rest(
 
 
 def _weighted(named: dict[str, Tensor]) -> Tensor:
+    """The sum of what was compared, each by its weight."""
     return (
         _REST * named["rest"] + _WEIGHTS * named["weights"] + _ROTATIONS * named["rotation"] + _JOINTS * named["joint"]
     )
@@ -127,11 +128,11 @@ def _weighted(named: dict[str, Tensor]) -> Tensor:
 
 def _compared(readings: tuple[Reading, Reading], posed: tuple[Posed, Posed]) -> dict[str, Tensor]:
     """Means over both meshes."""
-    of_source, of_target = (_compared_with(right, reading) for reading, right in zip(readings, posed, strict=True))
+    of_source, of_target = (_compared_with(reading, right) for reading, right in zip(readings, posed, strict=True))
     return {name: (value + of_target[name]) / 2 for name, value in of_source.items()}
 
 
-def _compared_with(right: Posed, reading: Reading) -> dict[str, Tensor]:
+def _compared_with(reading: Reading, right: Posed) -> dict[str, Tensor]:
     there = right.present / right.present.sum(1, keepdim=True)
     turned = (reading.rotations - right.rotations).square().sum((2, 3))
     away = (reading.joints - right.joints).square().sum(2)

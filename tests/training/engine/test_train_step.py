@@ -76,6 +76,7 @@ def by_two(_pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", CUTS)
 def test_one_rank_equals_two_ranks_equals_parts(dataset: str, tmp_path: Path, by_two: Path, name: str) -> None:
     train(cut(name), data=dataset, run=tmp_path / "one")
+    assert ("loss/at_rest" in read_journal(tmp_path / "one" / "metrics.jsonl")[0]) == (name == "parts")
     train(cut(name, accumulate=2), data=dataset, run=tmp_path / "parts")
     for run in (tmp_path / "parts", by_two / name):
         assert torch.allclose(losses(run), losses(tmp_path / "one"), rtol=CUTS[name][1], atol=0), run

@@ -125,7 +125,7 @@ def test_of_a_part_that_was_misread_the_rest_is_to_be_read() -> None:
     assert losses["at_rest"].abs() < 1e-5
     wrong, _ = read_twice(rotations=rotations, step=0 * STEP, again=again.mT, joints_again=joints)
     assert wrong["at_rest"] > 0.01 and wrong["rotation"] == losses["rotation"]
-    more = {name: float(wrong[name] - losses[name]) for name in ("total", "at_rest")}
+    more = {name: (wrong[name] - losses[name]).item() for name in ("total", "at_rest")}
     assert more["total"] == pytest.approx(2 * more["at_rest"], rel=1e-3)
 
 
@@ -136,3 +136,40 @@ def test_of_a_joint_that_was_misread_the_step_to_it_is_turned_with_the_body() ->
     assert losses["at_rest"].abs() < 1e-6 < losses["joint"]
     as_read, _ = read_twice(**found, joints_again=boxed_at_rest(JOINTS + STEP @ TURN))
     assert as_read["at_rest"] > 0.0005
+
+
+def test_of_a_joint_between_parts_that_are_turned_apart_half_of_the_step_goes_along_with_each() -> None:
+    """As by half of its weight linear blend skinning takes it along with each."""
+    bend = turned_about(torch.tensor([[0.9, 0.0, 0.0]]))[0]
+    rotations = torch.stack([torch.eye(3), bend])[None]
+    step = torch.tensor([0.0, 0.03, 0.05])
+    weights = torch.tensor([[[1.0, 0], [1, 0], [0, 1], [0, 1]]])
+    mesh = torch.cat([AT_REST[:, :2], (AT_REST[:, 2:] - JOINTS[:, 1:]) @ bend.T + JOINTS[:, 1:]], dim=1)
+    posed = Posed(weights, AT_REST, JOINTS, rotations, JOINTS + torch.stack([0 * step, step]), torch.ones(1, 2))
+    first = Reading(1e4 * weights, AT_REST, rotations, JOINTS)
+    expected = JOINTS + torch.stack([0 * step, (step + bend.T @ step) / 2])
+    second = first._replace(rotations=torch.eye(3).expand(1, 2, 3, 3), joints=boxed_at_rest(expected))
+    network = Knowing((first, first), (second, second))
+    _, named = parts_loss(network, source=mesh, target=mesh, truth=mesh, posed=(posed, posed), at_rest=True)
+    assert named["at_rest"].abs() < 1e-6 < named["joint"]
+
+
+def test_what_is_near_along_the_surfaces_is_told_at_rest_too_and_each_mesh_is_its_own() -> None:
+    legs = Parts(joints={"pelvis": None, "head": "pelvis"}, width=8, token_width=8, blocks=1)
+    meshes = {"source": AT_REST, "target": AT_REST.flip(1) * 0.5, "truth": AT_REST}
+    posed = Posed(
+        torch.full((1, 4, 2), 0.5), AT_REST, JOINTS, torch.eye(3).expand(1, 2, 3, 3), JOINTS, torch.ones(1, 2)
+    )
+    asked = list[tuple[object, ...]]()
+
+    def read_pair(*given: object) -> tuple[Reading, Reading]:
+        asked.append(given)
+        return Parts.read_pair(legs, *given[:2])  # type: ignore[arg-type]
+
+    legs.read_pair = read_pair  # type: ignore[method-assign]
+    surfaces: object = (object(), object())
+    parts_loss(legs, **meshes, posed=(posed, posed), surfaces=surfaces, at_rest=True)  # type: ignore[arg-type]
+    (first, _), (again, other) = (given[:2] for given in asked)
+    assert [given[2] for given in asked] == [surfaces, surfaces]
+    assert isinstance(again, Tensor) and isinstance(other, Tensor) and first is AT_REST
+    assert not torch.allclose(again, other), "the target is not the source"

@@ -49,7 +49,8 @@ def require_step_memory(recipe: TrainingRecipe, dataset: Dataset, room: Room, *,
 
 def least_step_bytes(recipe: TrainingRecipe, vertices: int, *, meshes: int, processes: int) -> float:
     """The memory that a step of so many meshes at a time takes at least, of processes that share it."""
-    of_a_mesh = _ACTIVATIONS * sum(_widths(recipe.network)) * vertices
+    readings = 2 if recipe.augmentation.at_rest else 1
+    of_a_mesh = readings * _ACTIVATIONS * sum(_widths(recipe.network)) * vertices
     return processes * (_PARAMETER * _parameters(recipe.network) + meshes * of_a_mesh)
 
 
