@@ -16,9 +16,11 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
-_WEIGHT = {"dressed": 1.15}
-"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which is less exact on bare
-people, is to read people clearly better than `human` does (docs/results/transfer.md)."""
+_WEIGHT = {"dressed": 2.35}
+"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which has learned meshes at
+rest and is less exact on bare people, is to read people clearly better than `human` does (docs/results/transfer.md)."""
+_LIMIT = {"dressed": 5.0}
+"""Degrees of rest error up to which weights read a mesh, where that is not `MISREAD`."""
 Load = Callable[..., PoseTransfer]
 """As :meth:`PoseTransfer.from_run`; a process that poses many meshes has one that keeps what it loaded."""
 
@@ -135,7 +137,12 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     kind = target or source or KINDS["human"]
     known = [place for place in range(2) if kinds[place] == kind]
     able = [name for name in every if KINDS[name] == kind]
-    taken = min(able, key=lambda name: _WEIGHT.get(name, 1) * max([errors[name][place] for place in known] or [0]))
+
+    def unfit(name: str) -> tuple[bool, float]:
+        worst = max([errors[name][place] for place in known] or [0])
+        return worst > _limit(name), _WEIGHT.get(name, 1) * worst
+
+    taken = min(able, key=unfit)
     why = f"they know {(job.sources[0], job.target)[known[-1]]}" if known else "for every such mesh"
     reason = f"the weights {taken} are taken, as {why}. {POOR}"
     doubts = (
@@ -151,12 +158,17 @@ Errors = dict[str, list[float]]
 
 def _kind(errors: Errors, place: int) -> str | None:
     """What a mesh is by the weights that read it best, if any reads it."""
-    able = [name for name, found in errors.items() if found[place] <= MISREAD]
+    able = [name for name, found in errors.items() if found[place] <= _limit(name)]
     return KINDS[min(able, key=lambda name: errors[name][place])] if able else None
+
+
+def _limit(name: str) -> float:
+    return _LIMIT.get(name, MISREAD)
 
 
 def _neither(errors: Errors, place: int) -> str:
     each = [f"{found[place]:.0f} ({name})" for name, found in errors.items()]
     known = " nor ".join(dict.fromkeys(KINDS.values()))
     misread = f"{', '.join(each[:-1])} and {each[-1]}"
-    return f"neither {known} as the weights know them: misread by {misread} degrees, more than {MISREAD:g}"
+    others = ", ".join(f"{name}: {limit:g}" for name, limit in _LIMIT.items())
+    return f"neither {known} as the weights know them: misread by {misread} degrees, more than {MISREAD:g} ({others})"

@@ -26,12 +26,14 @@ FACES = np.array([[0, 1, 2]])
 PERSON, ANIMAL, BOX, STICK, SKIRT, GOWN, CRAWLER, TIGHT_SKIRT, NET = (
     Mesh(np.eye(3) * float(size), FACES) for size in range(1, 10)
 )
+FOLDED, COAT, CART = (Mesh(np.eye(3) * float(size), FACES) for size in (11, 12, 13))
 WIDE_SKIRT = Mesh(np.concatenate([np.eye(3), -np.eye(3)]) * 10.0, np.concatenate([FACES, FACES + 3]))
 ERRORS = {
-    ("human", 1): 3.0, ("human", 2): 6.5, ("human", 5): 6.7, ("dressed", 1): 3.5, ("dressed", 2): 6.8,
-    ("dressed", 5): 4.5, ("animals", 1): 6.9, ("animals", 2): 3.0, ("human", 6): 20.0, ("dressed", 6): 5.0,
-    ("animals", 6): 12.0, ("human", 7): 5.2, ("animals", 7): 6.8, ("human", 8): 3.1, ("dressed", 8): 4.0,
-    ("human", 9): 3.2, ("dressed", 9): 4.1, ("human", 10): 3.3, ("dressed", 10): 4.2,
+    ("human", 1): 3.0, ("human", 2): 6.5, ("human", 5): 6.7, ("dressed", 1): 1.8, ("dressed", 2): 6.8,
+    ("dressed", 5): 2.5, ("animals", 1): 6.9, ("animals", 2): 3.0, ("human", 6): 20.0, ("dressed", 6): 3.5,
+    ("animals", 6): 12.0, ("human", 7): 5.2, ("animals", 7): 6.8, ("human", 8): 3.1, ("dressed", 8): 1.9,
+    ("human", 9): 3.2, ("dressed", 9): 2.0, ("human", 10): 3.3, ("dressed", 10): 2.1, ("human", 11): 5.5,
+    ("dressed", 11): 2.7, ("human", 12): 8.0, ("dressed", 12): 4.0, ("dressed", 13): 6.0,
 }  # fmt: skip
 """Degrees: at worst a way is found in which an animal passes for a person, and a person for an animal, but worse."""
 Choose = Callable[..., tuple[str, list[float]]]
@@ -103,13 +105,16 @@ def choose(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> Choose:
         (ANIMAL, BOX, "animals", [3.0, 30.0]),
         (BOX, PERSON, "human", [30.0, 3.0]),
         (BOX, BOX, "human", [30.0, 30.0]),
-        (PERSON, SKIRT, "dressed", [3.5, 4.5]),
-        (SKIRT, PERSON, "dressed", [4.5, 3.5]),
-        (SKIRT, BOX, "dressed", [4.5, 30.0]),
-        (GOWN, GOWN, "dressed", [5.0, 5.0]),
+        (PERSON, SKIRT, "dressed", [1.8, 2.5]),
+        (SKIRT, PERSON, "dressed", [2.5, 1.8]),
+        (SKIRT, BOX, "dressed", [2.5, 30.0]),
+        (GOWN, GOWN, "dressed", [3.5, 3.5]),
+        (FOLDED, PERSON, "human", [5.5, 3.0]),  # bare: dressed reads it with less error, but not by far
+        (COAT, PERSON, "dressed", [4.0, 1.8]),  # not by far either, but human misreads it
+        (CART, CART, "human", [30.0, 30.0]),  # 6 degrees are too many for dressed
         (CRAWLER, CRAWLER, "human", [5.2, 5.2]),
-        (PERSON, TIGHT_SKIRT, "dressed", [3.5, 4.0]),  # which human knows, but tears
-        (PERSON, WIDE_SKIRT, "dressed", [3.5, 4.2]),  # which dressed tears half as much
+        (PERSON, TIGHT_SKIRT, "dressed", [1.8, 1.9]),  # which human knows, but tears
+        (PERSON, WIDE_SKIRT, "dressed", [1.8, 2.1]),  # which dressed tears half as much
         (PERSON, NET, "human", [3.0, 3.2]),  # which both tear alike
     ],
 )
@@ -121,7 +126,7 @@ def test_by_the_mesh_that_is_understood(
 
 
 def test_what_no_weights_know_is_told_of_as_nothing_else(choose: Choose, said: list[str]) -> None:
-    misread = r"misread by 30 \(human\), 30 \(dressed\) and 30 \(animals\) degrees, more than 7;"
+    misread = r"misread by 30 \(human\), 30 \(dressed\) and 30 \(animals\) degrees, more than 7 \(dressed: 5\);"
     neither = rf"is neither a person nor an animal .*: {misread}"
     for source, target, reasons in (
         (PERSON, PERSON, ("", "")),
