@@ -292,7 +292,7 @@ class TrainingRecipe(Frozen):
             if getattr(self.augmentation, name) and not isinstance(self.network, PartsRecipe):
                 raise ValueError(
                     f"augmentation.{name} needs the rigs that network 'parts' is told of, but the network is "
-                    f"{self.network.name!r}: leave augmentation.{name} out"
+                    f"{self.network.name!r}: set augmentation.{name} to {'false' if name == 'at_rest' else 0}"
                 )
         self._refuse_what_parts_does_not_know()
         self._refuse_what_avatars_do_not_know()

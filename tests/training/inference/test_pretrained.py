@@ -76,7 +76,7 @@ def test_people_who_fold_their_limbs_are_found_to_stand_as_they_do(
     found = human.standing(Mesh(turn.apply(mesh.vertices), mesh.faces))
     assert isinstance(found, Standing)
     left = Rotation.from_matrix(found.lean.T @ found.matrix) * turn
-    assert np.degrees(left.magnitude()) < 20
+    assert np.degrees(left.magnitude()) < (20 if pose == "hugging the knees" else 15)
 
 
 def test_what_is_read_of_a_body_that_is_not_dense_is_most_of_it() -> None:
