@@ -1,6 +1,6 @@
 """Which of the weights that come along pose two meshes: those of people, of people in clothes, or of animals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,9 +16,9 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
-_WEIGHT = {"dressed": 2.35}
-"""By which rest errors are multiplied where weights of one kind are compared: `dressed`, which has learned meshes at
-rest and is less exact on bare people, is to read people clearly better than `human` does (docs/results/transfer.md)."""
+_WIDE = 2.35
+"""How many times the rest error of `dressed` `human` has at least on who wears wide clothes. On all others it has more,
+too, as `dressed` has learned meshes at rest, but is the more exact (docs/results/transfer.md)."""
 _LIMIT = {"dressed": 5.0}
 """Degrees of rest error up to which weights read a mesh, where that is not `MISREAD`."""
 Load = Callable[..., PoseTransfer]
@@ -136,13 +136,7 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         )
     kind = target or source or KINDS["human"]
     known = [place for place in range(2) if kinds[place] == kind]
-    able = [name for name in every if KINDS[name] == kind]
-
-    def unfit(name: str) -> tuple[bool, float]:
-        worst = max([errors[name][place] for place in known] or [0])
-        return worst > _limit(name), _WEIGHT.get(name, 1) * worst
-
-    taken = min(able, key=unfit)
+    taken = "dressed" if kind == KINDS["dressed"] and _wear_wide_clothes(errors, known) else _first_of(every, kind)
     why = f"they know {(job.sources[0], job.target)[known[-1]]}" if known else "for every such mesh"
     reason = f"the weights {taken} are taken, as {why}. {POOR}"
     doubts = (
@@ -160,6 +154,17 @@ def _kind(errors: Errors, place: int) -> str | None:
     """What a mesh is by the weights that read it best, if any reads it."""
     able = [name for name, found in errors.items() if found[place] <= _limit(name)]
     return KINDS[min(able, key=lambda name: errors[name][place])] if able else None
+
+
+def _wear_wide_clothes(errors: Errors, places: list[int]) -> bool:
+    """Whether `dressed` reads all of these people, and one of them clearly better than `human` does."""
+    pairs = [(errors["human"][place], errors["dressed"][place]) for place in places]
+    read = all(dressed <= _limit("dressed") for _, dressed in pairs)
+    return read and any(human > min(_WIDE * dressed, MISREAD) for human, dressed in pairs)
+
+
+def _first_of(names: Iterable[str], kind: str) -> str:
+    return next(name for name in names if KINDS[name] == kind)
 
 
 def _limit(name: str) -> float:
