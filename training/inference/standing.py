@@ -113,7 +113,7 @@ class Standing:
         return vertices @ self.matrix
 
 
-def standing(understand: Understanding, mesh: Floats, seen: "_Seen | None" = None) -> Standing:
+def standing(understand: Understanding, mesh: Floats) -> Standing:
     """Find how a mesh stands.
 
     A mesh that is understood as it is stays so, but for a clear turn about the vertical. Of one that is not, twelve
@@ -130,14 +130,16 @@ def standing(understand: Understanding, mesh: Floats, seen: "_Seen | None" = Non
         Vertices [n, 3] in any unit; 256 of them are read, 64 to rank many ways, and to rule out turns aside of a mesh
         that is understood as it is. As it is, a mesh that is not understood by 256 is read by 512: they leave less
         misfit, so that it stays so where that is in doubt.
-    seen
-        How it is seen as it is, by 256, where that is known.
     """
-    ways = _Ways(understand, _probe(mesh), _VERTICES)
-    as_it_is = seen or ways.seen([np.eye(3)])[0]
+    ways = _Ways(understand, _probe(mesh))
+    return _found(ways, ways.as_it_is())
+
+
+def _found(ways: "_Ways", as_it_is: "_Seen") -> Standing:
+    """How a mesh stands that is seen so as it is (`standing`)."""
     at_first = ways
     if as_it_is.misfit > KNOWN and (more := ways.by_more()):
-        at_first, as_it_is = more, more.seen([np.eye(3)])[0]
+        at_first, as_it_is = more, more.as_it_is()
     if as_it_is.misfit <= KNOWN and at_first.none_is_clearer(as_it_is):
         return at_first.faced(as_it_is).stands if as_it_is.is_aside else as_it_is.stands
     best = min(ways.seen([_about_vertical(angle) for angle in _ANGLES]), key=lambda way: way.misfit)
@@ -175,65 +177,68 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     error of at most 1.25 times the other way's, stays so. One that is misread even then, and was not found to lean, is
     turned by quarters about all axes, where that makes the rest error clearly less.
     """
-    understand, eye = understanding_of(network), np.eye(3)
-    seen = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([eye])[0]
+    body = _Body(network, mesh)
+    seen = body.ways.as_it_is()
     in_doubt = seen.misfit > KNOWN or seen.is_aside
-    as_it_is, root = _read(network, mesh) if in_doubt else (np.nan, seen.root)
-    stays = Standing(eye, seen.misfit, rest_error=as_it_is, root=root)
-    if as_it_is <= SURELY_READ and _is_straight(root) and _leaning(root) <= _UPRIGHT:
+    stays = body.read(seen.way, seen.misfit) if in_doubt else seen.stands
+    assert stays.root is not None
+    if stays.rest_error <= SURELY_READ and _is_straight(stays.root) and _leaning(stays.root) <= _UPRIGHT:
         return stays
-    found = standing(understand, mesh.vertices, seen)
-    if found.leans or not np.array_equal(found.matrix, eye):
-        found = _rather(network, mesh, found, stays)
+    found = _found(body.ways, seen)
+    if found.leans or not np.array_equal(found.matrix, stays.matrix):
+        found = body.rather(found, stays)
     elif in_doubt:
-        found = replace(found, rest_error=as_it_is, root=root)
+        found = replace(found, rest_error=stays.rest_error, root=stays.root)
     if found.leans or not found.rest_error > MISREAD:
         return found
-    if clearer := _clearer_turn(network, mesh, found):
+    if clearer := body.clearer_turn(found):
         return clearer
     return replace(found, rest_error=rest_error(network, Mesh(found.turned(mesh.vertices), mesh.faces)))
 
 
-def _rather(network: Parts, mesh: Mesh, found: Standing, stays: Standing) -> Standing:
-    """The way found for a mesh, facing ahead, or that it stays as it is, where its surface is read as well then."""
-    error = rest_error(network, Mesh(found.upright(mesh.vertices), mesh.faces))
-    if np.isnan(stays.rest_error):
-        as_it_is, root = _read(network, mesh)
-        stays = replace(stays, rest_error=as_it_is, root=root)
-    assert stays.root is not None
-    if stays.rest_error <= _NEARLY * error and _is_straight(stays.root):
-        return stays
-    return replace(found, rest_error=error) if found.leans else _faced(network, mesh, found.matrix)
+class _Body:
+    """A mesh whose surface a network reads, as it is turned."""
 
+    def __init__(self, network: Parts, mesh: Mesh) -> None:
+        self._network, self._mesh = network, mesh
+        self.ways = _Ways(understanding_of(network), _probe(mesh.vertices))
 
-def _faced(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
-    """A mesh in this way [3, 3], turned about the vertical until its surface is read to face ahead."""
-    found = _by(network, mesh, way)
-    for _ in range(_TURNS):
-        assert found.root is not None
-        if _is_straight(found.root):
-            break
-        ahead = _by(network, mesh, _about_vertical(-_facing(found.root)) @ found.matrix)
-        if ahead.rest_error > _NEARLY * found.rest_error:
-            break
-        found = ahead
-    return found
+    def read(self, way: NDArray[np.float64], misfit: float) -> Standing:
+        """Turned in this way [3, 3], which leaves such a misfit."""
+        error, root = _read(self._network, Mesh(self._mesh.vertices @ way.T, self._mesh.faces))
+        return Standing(way, misfit, rest_error=error, root=root)
 
+    def rather(self, found: Standing, stays: Standing) -> Standing:
+        """The way found, facing ahead, or that it stays as it is, where its surface is read as well then."""
+        error = rest_error(self._network, Mesh(found.upright(self._mesh.vertices), self._mesh.faces))
+        if np.isnan(stays.rest_error):
+            stays = self.read(stays.matrix, stays.misfit)
+        assert stays.root is not None
+        if stays.rest_error <= _NEARLY * error and _is_straight(stays.root):
+            return stays
+        if found.leans:
+            return replace(found, rest_error=error)
+        return self._faced(self.read(found.matrix, found.misfit))
 
-def _clearer_turn(network: Parts, mesh: Mesh, found: Standing) -> Standing | None:
-    """The turn by quarters of a mesh in the way found with clearly less rest error, if there is one."""
-    understand = understanding_of(network)
-    turned = _Ways(understand, _probe(mesh.vertices), _VERTICES).seen([turn @ found.matrix for turn in _QUARTER_TURNS])
-    likely = sorted(turned, key=lambda turn: turn.misfit)[:_KEPT_TURNS]
-    best = min((_by(network, mesh, turn.way) for turn in likely), key=lambda turn: turn.rest_error)
-    return _faced(network, mesh, best.matrix) if _CLEARLY * best.rest_error < found.rest_error else None
+    def clearer_turn(self, found: Standing) -> Standing | None:
+        """The turn by quarters from the way found with clearly less rest error, if there is one."""
+        turned = self.ways.seen([turn @ found.matrix for turn in _QUARTER_TURNS])
+        likely = sorted(turned, key=lambda turn: turn.misfit)[:_KEPT_TURNS]
+        best = min((self.read(turn.way, turn.misfit) for turn in likely), key=lambda turn: turn.rest_error)
+        return self._faced(best) if _CLEARLY * best.rest_error < found.rest_error else None
 
-
-def _by(network: Parts, mesh: Mesh, way: NDArray[np.float64]) -> Standing:
-    """A mesh turned in this way [3, 3], its surface read."""
-    turned = Mesh(mesh.vertices @ way.T, mesh.faces)
-    error, root = _read(network, turned)
-    return Standing(way, misfit(understanding_of(network), turned.vertices), rest_error=error, root=root)
+    def _faced(self, found: Standing) -> Standing:
+        """Turned about the vertical until its surface is read to face ahead."""
+        for _ in range(_TURNS):
+            assert found.root is not None
+            if _is_straight(found.root):
+                break
+            ahead = self.ways.seen([_about_vertical(-_facing(found.root)) @ found.matrix])[0]
+            read = self.read(ahead.way, ahead.misfit)
+            if read.rest_error > _NEARLY * found.rest_error:
+                break
+            found = read
+        return found
 
 
 def facing(understand: Understanding, vertices: Floats, before: NDArray[np.float64] | Standing) -> NDArray[np.float64]:
@@ -319,8 +324,11 @@ class _Seen(NamedTuple):
 class _Ways:
     """Ways to turn the points [n, 3] of a mesh, and what a network understands of it then."""
 
-    def __init__(self, understand: Understanding, points: Floats, vertices: int) -> None:
-        self._understand, self._points, self._vertices = understand, points, vertices
+    def __init__(self, understand: Understanding, points: Floats, vertices: int | None = None) -> None:
+        self._understand, self._points, self._vertices = understand, points, vertices or _VERTICES
+
+    def as_it_is(self) -> _Seen:
+        return self.seen([np.eye(3)])[0]
 
     def by_more(self) -> "_Ways | None":
         """The same by more vertices, where the mesh has any."""
