@@ -44,7 +44,7 @@ def understanding_of(network: Parts) -> Understanding:
 MISREAD = 7.0
 """Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
 animals that were read rightly by weights of their kind have less, things have more (docs/results/transfer.md)."""
-SURELY_READ = 4.8
+SURELY_READ = 3.5
 """Degrees of rest error up to which an upright mesh that faces ahead is read rightly: turned by a quarter or a half,
 and read so all the same, people and animals have more (docs/results/parts.md)."""
 KNOWN = 0.002

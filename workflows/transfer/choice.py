@@ -16,9 +16,9 @@ from workflows.pretrained import KINDS, own_weights
 from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
-_WIDE = 2.35
-"""How many times the rest error of `dressed` `human` has at least on who wears wide clothes. On all others it has more,
-too, as `dressed` has learned meshes at rest, but is the more exact (docs/results/transfer.md)."""
+_WIDE = 1.62
+"""How many times the rest error of `dressed` `human` has at least on most who wear wide clothes, none of which it knows
+well (`KNOWN`), and on few others (docs/results/transfer.md)."""
 _LIMIT = {"dressed": 5.0}
 """Degrees of rest error up to which weights read a mesh, where that is not `MISREAD`."""
 Load = Callable[..., PoseTransfer]
@@ -136,7 +136,9 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
         )
     kind = target or source or KINDS["human"]
     known = [place for place in range(2) if kinds[place] == kind]
-    taken = "dressed" if kind == KINDS["dressed"] and _wear_wide_clothes(errors, known) else _first_of(every, kind)
+    taken = (
+        "dressed" if kind == KINDS["dressed"] and _wear_wide_clothes(people, dressed, known) else _first_of(every, kind)
+    )
     why = f"they know {(job.sources[0], job.target)[known[-1]]}" if known else "for every such mesh"
     reason = f"the weights {taken} are taken, as {why}. {POOR}"
     doubts = (
@@ -156,11 +158,14 @@ def _kind(errors: Errors, place: int) -> str | None:
     return KINDS[min(able, key=lambda name: errors[name][place])] if able else None
 
 
-def _wear_wide_clothes(errors: Errors, places: list[int]) -> bool:
+def _wear_wide_clothes(human: Chosen, dressed: Chosen, places: list[int]) -> bool:
     """Whether `dressed` reads all of these people, and one of them clearly better than `human` does."""
-    pairs = [(errors["human"][place], errors["dressed"][place]) for place in places]
-    read = all(dressed <= _limit("dressed") for _, dressed in pairs)
-    return read and any(human > min(_WIDE * dressed, MISREAD) for human, dressed in pairs)
+    pairs = [(human.standings[place], dressed.standings[place]) for place in places]
+    read = all(theirs.rest_error <= _limit("dressed") for _, theirs in pairs)
+    return read and any(
+        own.rest_error > MISREAD or (own.misfit > KNOWN and own.rest_error > _WIDE * theirs.rest_error)
+        for own, theirs in pairs
+    )
 
 
 def _first_of(names: Iterable[str], kind: str) -> str:
