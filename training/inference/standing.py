@@ -42,11 +42,12 @@ def understanding_of(network: Parts) -> Understanding:
 
 
 MISREAD = 7.0
-"""Degrees of rest error above which a mesh is misread, or no body that the network knows: people, bare or dressed, and
-animals that were read rightly by weights of their kind have less, things have more (docs/results/transfer.md)."""
+"""Degrees of rest error above which a mesh is misread, or no body that the network knows: nearly all people, bare or
+dressed, and animals that were read rightly by weights of their kind have less, things have more
+(docs/results/transfer.md)."""
 SURELY_READ = 3.5
 """Degrees of rest error up to which an upright mesh that faces ahead is read rightly: turned by a quarter or a half,
-and read so all the same, people and animals have more (docs/results/parts.md)."""
+and read so all the same, people have more by `human`, animals by `animals` (docs/results/parts.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are
 (docs/results/transfer.md)."""
@@ -218,7 +219,7 @@ class _Body:
             return stays
         if found.leans:
             return replace(found, rest_error=error)
-        return self._faced(self.read(found.matrix, found.misfit))
+        return self._faced(self.read(found.matrix, self.ways.seen([found.matrix])[0].misfit))
 
     def clearer_turn(self, found: Standing) -> Standing | None:
         """The turn by quarters from the way found with clearly less rest error, if there is one."""

@@ -17,8 +17,11 @@ from workflows.transfer.job import TransferJob
 
 Pair = tuple[Standing, Standing]
 _WIDE = 1.62
-"""How many times the rest error of `dressed` `human` has at least on most who wear wide clothes, none of which it knows
-well (`KNOWN`), and on few others (docs/results/transfer.md)."""
+"""How many times the rest error of `dressed` `human` has at least on most who wear wide clothes
+(docs/results/transfer.md)."""
+_ILL_KNOWN = 1.5 * KNOWN
+"""Misfit that `human` leaves on all who wear wide clothes, and not on bare people whom it just reads badly: those whose
+limbs touch it still poses better than `dressed` does (docs/results/transfer.md)."""
 _LIMIT = {"dressed": 5.0}
 """Degrees of rest error up to which weights read a mesh, where that is not `MISREAD`."""
 Load = Callable[..., PoseTransfer]
@@ -159,12 +162,11 @@ def _kind(errors: Errors, place: int) -> str | None:
 
 
 def _wear_wide_clothes(human: Chosen, dressed: Chosen, places: list[int]) -> bool:
-    """Whether `dressed` reads all of these people, and one of them clearly better than `human` does."""
+    """Whether `dressed` reads all of these people, and one whom `human` knows ill clearly better than that does."""
     pairs = [(human.standings[place], dressed.standings[place]) for place in places]
     read = all(theirs.rest_error <= _limit("dressed") for _, theirs in pairs)
     return read and any(
-        own.rest_error > MISREAD or (own.misfit > KNOWN and own.rest_error > _WIDE * theirs.rest_error)
-        for own, theirs in pairs
+        own.misfit > _ILL_KNOWN and own.rest_error > min(_WIDE * theirs.rest_error, MISREAD) for own, theirs in pairs
     )
 
 

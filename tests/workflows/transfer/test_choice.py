@@ -26,15 +26,18 @@ FACES = np.array([[0, 1, 2]])
 PERSON, ANIMAL, BOX, STICK, SKIRT, GOWN, CRAWLER, TIGHT_SKIRT, NET = (
     Mesh(np.eye(3) * float(size), FACES) for size in range(1, 10)
 )
-FOLDED, COAT, CART, KNEELER, HANDS_UP = (Mesh(np.eye(3) * float(size), FACES) for size in (11, 12, 13, 14, 15))
+FOLDED, COAT, CART, KNEELER, HANDS_UP, CAPE, ONE_LEGGED = (
+    Mesh(np.eye(3) * float(size), FACES) for size in range(11, 18)
+)
 WIDE_SKIRT = Mesh(np.concatenate([np.eye(3), -np.eye(3)]) * 10.0, np.concatenate([FACES, FACES + 3]))
 ERRORS = {
     ("human", 1): 3.0, ("human", 2): 6.5, ("human", 5): 6.7, ("dressed", 1): 1.8, ("dressed", 2): 6.8,
     ("dressed", 5): 2.5, ("animals", 1): 6.9, ("animals", 2): 3.0, ("human", 6): 20.0, ("dressed", 6): 3.5,
     ("animals", 6): 12.0, ("human", 7): 5.2, ("animals", 7): 6.8, ("human", 8): 3.1, ("dressed", 8): 1.9,
-    ("human", 9): 3.2, ("dressed", 9): 2.0, ("human", 10): 3.3, ("dressed", 10): 2.1, ("human", 11): 4.3,
-    ("dressed", 11): 2.7, ("human", 12): 8.0, ("dressed", 12): 4.0, ("dressed", 13): 6.0,
-    ("human", 14): 6.0, ("dressed", 14): 4.6, ("human", 15): 3.9, ("dressed", 15): 2.0,
+    ("human", 9): 3.2, ("dressed", 9): 2.0, ("human", 10): 3.3, ("dressed", 10): 2.1, ("human", 11): 6.4,
+    ("dressed", 11): 4.1, ("human", 12): 8.0, ("dressed", 12): 4.0, ("dressed", 13): 6.0,
+    ("human", 14): 6.0, ("dressed", 14): 4.6, ("human", 15): 5.5, ("dressed", 15): 2.6,
+    ("human", 16): 6.5, ("dressed", 16): 3.9, ("human", 17): 11.6, ("dressed", 17): 4.2,
 }  # fmt: skip
 """Degrees: at worst a way is found in which an animal passes for a person, and a person for an animal, but worse."""
 Choose = Callable[..., tuple[str, list[float]]]
@@ -51,7 +54,7 @@ class Understanding:
 
     def misfit(self, vertices: np.ndarray) -> float:
         size = round(float(np.abs(vertices).max()))
-        if size == 4 or (size, self.name) == (7, "animals"):
+        if size in (4, 17) or (size, self.name) == (7, "animals"):
             return 0.001  # nothing is left of a stick, however its parts are read; nor of who crawls, read as an animal
         return 0.0005 * self.rest_error(Mesh(vertices, FACES))  # 0.0015 of a person, 0.0038 of an animal read as one
 
@@ -110,8 +113,10 @@ def choose(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> Choose:
         (SKIRT, PERSON, "dressed", [2.5, 1.8]),
         (SKIRT, BOX, "dressed", [2.5, 30.0]),
         (GOWN, GOWN, "dressed", [3.5, 3.5]),
-        (FOLDED, PERSON, "human", [4.3, 3.0]),  # bare: dressed reads it with less error, but not by far
-        (HANDS_UP, FOLDED, "human", [3.9, 4.3]),  # by far, but human knows it well
+        (FOLDED, PERSON, "human", [6.4, 3.0]),  # bare: dressed reads it with less error, but not by far
+        (HANDS_UP, PERSON, "human", [5.5, 3.0]),  # by far, but human knows it rather well
+        (CAPE, PERSON, "dressed", [3.9, 1.8]),
+        (ONE_LEGGED, PERSON, "human", [11.6, 3.0]),  # misread, but bare: dressed reads its surface better alone
         (COAT, PERSON, "dressed", [4.0, 1.8]),  # not by far either, but human misreads it
         (KNEELER, PERSON, "human", [6.0, 3.0]),
         (KNEELER, SKIRT, "dressed", [4.6, 2.5]),  # one of both wears a skirt
