@@ -109,7 +109,8 @@ def chosen(job: TransferJob, meshes: tuple[Mesh, Mesh], *, force: bool, load: Lo
     which it passes for a person, but worse by far than people do. Nor are `animals` where it reads both surely, nor is
     `dressed` where `animals` knows both well, and better than `human` does. But where `human`, sure of both, tears the
     target in the first source's pose, as it may a skirt, and `dressed` reads both and tears at most half as many edges,
-    the latter is taken.
+    the latter is taken. So it is for people in wide clothes, whom `human` does not know well: where `dressed` reads
+    all people, and one of them clearly better than `human` does.
 
     Raises
     ------
