@@ -6,9 +6,9 @@ from pathlib import Path
 
 
 def test_the_benchmark_of_input_waiting_runs() -> None:
-    command = [sys.executable, "-m", "benchmarks.training.input_wait", "--quick", "--threads", "1", "--device", "cpu"]
+    command = [sys.executable, "-m", "benchmarks.training.input_wait", "--quick", "--rounds", "1", "--threads", "1"]
     done = subprocess.run(
-        [*command, "--poses", "20"],
+        [*command, "--device", "cpu", "--poses", "20"],
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
