@@ -40,7 +40,7 @@ test: $(READY) ## the test suite, by as many processes as there are CPUs, at mos
 	@$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
 
 test-cluster: $(READY) ## the services of docker-compose.yml as processes, and a job submitted to them
-	@$(BIN)/python -m pytest -m cluster $$(grep -rl 'mark\.cluster' tests --include='test_*.py') $(ARGS)
+	@$(BIN)/python -m pytest -m cluster $(if $(findstring tests/,$(ARGS)),,$$(grep -rl 'mark\.cluster' tests --include='test_*.py' | sort)) $(ARGS)
 
 test-hosts: $(READY) ## Ray nodes, MLflow, S3 on hosts of their own (namespaces, as root), faults between them: half an hour
 	@$(BIN)/python -m pytest -m hosts $(ARGS)
