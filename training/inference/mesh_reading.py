@@ -3,11 +3,11 @@
 A parts network poses the vertices of a mesh as they are, but reads rough ones, which have noise, through a low-pass
 filter along the edges (:mod:`datagen.mesh.low_pass`). Outputs of people that are as finely meshed as their sources are
 then compared with these through the same filter, so that what it does to a body is no difference. Filtered people, and
-people of points, are read as their mirror images, too (animals' rigs are not alike on both sides). Of a source of
-points up to 2,048 are read, of a mesh 1,024 vertices; a source that lists the vertices of its target in the same order
-is read at those at which the target is. A transfer reads its meshes so, and what measures transfers of single meshes.
-Evaluations on datasets, whose bodies have no noise, do not; nor does what asks how a mesh stands, whether it is a body,
-in which pose an avatar is to be, or onto which parts an output is projected.
+people of points, are read as their mirror images, too (animals' rigs are not alike on both sides). A source that lists
+the vertices of its target in the same order is read at those at which the target is. A transfer reads its meshes so,
+and what measures transfers of single meshes. Evaluations on datasets, whose bodies have no noise, do not; nor does what
+asks how a mesh stands, whether it is a body, in which pose an avatar is to be, or onto which parts an output is
+projected.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from datagen.common.arrays import Floats
 from datagen.mesh.geometry import Mesh, bounding_box, edges_of
 from datagen.mesh.low_pass import LowPass
-from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.networks.parts import Parts, ReadTarget
 from training.recipes.networks import PEOPLE
@@ -40,9 +39,6 @@ _ALIKE = 1.5
 """How many times as many vertices as the source a target may have, or the source as the target, where outputs are read
 through a person's filter, too.
 """
-_MOST_POINTS = 2 * MOST_SAMPLED
-"""Points of a source that are read at most: twice as many as of a mesh leave a tenth less error
-(docs/results/parts.md)."""
 _CORNERS_A_VERTEX = 3
 """How many corners of faces a vertex has at least, on average, where faces tell which vertices are listed: in triangle
 soups one, in soups of quads one and a half, in large closed meshes about six. Of soups of small closed pieces it does
@@ -152,14 +148,12 @@ def posed_targets(
 
     of_people, of_points = network.joints == tuple(PEOPLE), torch.tensor([has_points(source) for source in sources])
     twice = of_people & (of_points | torch.tensor([times > 0 for times in filtered]))
-    most = torch.where(of_points, _MOST_POINTS, MOST_SAMPLED)
     return network.posed_target(
         stacked(network, vertices),
         read,
         surface,
         heard=heard if any(through) else None,
         twice=twice.to(device_of(network)) if twice.any() else None,
-        most=most if of_points.any() else None,
         alike=alike if alike.any() else None,
     )
 

@@ -226,7 +226,6 @@ class Parts(nn.Module):
         *,
         heard: Callable[[Tensor], Tensor] | None = None,
         twice: Tensor | None = None,
-        most: Tensor | None = None,
         alike: Tensor | None = None,
     ) -> Tensor:
         """Return what calling the network outside of training does, of targets that were read before.
@@ -236,18 +235,17 @@ class Parts(nn.Module):
         rough mesh is partly chance, and the mean of both has less of it. Without effect where no parts are called
         left and right. ``alike`` says which sources [b] list the target's vertices in the target's order.
         They are read at the vertices at which the target and the output are, so that more of the errors cancel; of
-        surfaces the target's counts. ``most``: of the vertices of each other source [b], how many are read at most; by
-        default `training.networks.layers.sampling.MOST_SAMPLED`. Both are asked on the CPU.
+        surfaces the target's counts. It is asked on the CPU.
         """
         check_pair(source, target.vertices, self.lift.weight.dtype)
         with full_precision(source):
             if alike is None or not bool(alike.any()):
-                return self._corrected(self._rotations(sample(source, surface, most), twice), target, heard, twice)
+                return self._corrected(self._rotations(sample(source, surface), twice), target, heard, twice)
             drawn = target.drawn
             broken = source.sum((1, 2)) * 0  # not a number where one is, in the sample or not
             wanted = self._rotations(drawn.moved(taken(source, drawn.rows)), twice) + broken[:, None, None, None]
             if not bool(alike.all()):
-                of_others = self._rotations(sample(source, surface, most), twice)
+                of_others = self._rotations(sample(source, surface), twice)
                 wanted = torch.where(alike.to(source.device)[:, None, None, None], wanted, of_others)
             return self._corrected(wanted, target, heard, twice)
 

@@ -227,7 +227,7 @@ def test_cuda_augments_as_the_cpu_does(
     dataset: str, monkeypatch: pytest.MonkeyPatch, step: int, most_sampled: int
 ) -> None:
     """At steps where it is not for rounding to say which of a round leg's vertices are the nearest to a hole."""
-    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", most_sampled)
+    monkeypatch.setattr("training.data.rigs.rig_table._DENSE", most_sampled)
     here, there = (augmented(dataset, step=step, device=device) for device in ("cpu", "cuda"))
     assert there.source.device.type == "cuda"
     alike(here, there.to("cpu"))

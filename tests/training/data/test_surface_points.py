@@ -147,7 +147,7 @@ def test_of_dense_meshes_vertices_are_drawn_by_the_area_around_them(
     rigs = RigTable(BodiesAtRest(legs, identities), LEG, device="cpu")
     whole = open_bank(legs, identities).batch(TRIPLES)
     assert rigs.areas(TRIPLES, whole) == (None, None), "of so few vertices a network samples all"
-    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", 10)
+    monkeypatch.setattr("training.data.rigs.rig_table._DENSE", 10)
     recipe = tiny_training(**{**PARTS, "augmentation": {"subset": 8}})
     drawn = [Augmentation(recipe, rigs)(TRIPLES, whole, step=step, first=0) for step in range(400)]
     of_sources, of_targets = rigs.areas(TRIPLES, whole)
@@ -180,7 +180,7 @@ def test_areas_are_of_the_vertices_that_are_left_of_each_dense_mesh(
     mixed = open_dataset(generate(mixed_dataset(), str(tmp_path / "legs.zarr")).url)
     identities = mixed.identities("training")
     bank, rigs = open_bank(mixed, identities), RigTable(BodiesAtRest(mixed, identities), LEG, device="cpu")
-    monkeypatch.setattr("training.data.rigs.rig_table.MOST_SAMPLED", most)
+    monkeypatch.setattr("training.data.rigs.rig_table._DENSE", most)
     assert [len(each.areas) for each in kinds] == [*MIXED_COUNTS], "as many topologies as there are kinds of legs"
     triples = np.array([[0, 1, 1, 2], [1, 3, 2, 0], [2, 0, 3, 5], [3, 2, 0, 1]])
     dense = np.array([[mixed.vertex_count(int(own)) > most for own in pair] for pair in triples[:, [0, 2]]])

@@ -10,7 +10,6 @@ from datagen.mesh.geometry import Mesh
 from datagen.mesh.low_pass import LowPass
 from tests.support.shapes.avatars import noisy, sphere
 from tests.support.three_networks import lively
-from training.inference import mesh_reading
 from training.inference.mesh_reading import (
     lists_alike,
     posed_targets,
@@ -19,7 +18,7 @@ from training.inference.mesh_reading import (
     surface_of_meshes,
     transferred,
 )
-from training.networks.layers.sampling import MOST_SAMPLED, Sample
+from training.networks.layers.sampling import Sample
 from training.networks.parts import Parts
 from training.recipes.networks import PEOPLE
 
@@ -117,18 +116,6 @@ def test_unwelded_meshes_do_not_tell_by_their_faces_which_vertices_they_list() -
     assert not lists_alike(ball, sphere(subdivisions=2)) and lists_alike(*[Mesh(ball.vertices, ball.faces[:-3])] * 2)
     loose = Mesh(np.concatenate([ball.vertices, ball.vertices[:1]]), ball.faces)
     assert not lists_alike(loose, loose) and not lists_alike(*[Mesh(ball.vertices, NO_FACES)] * 2)
-
-
-def test_more_points_are_read_than_vertices_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each by itself: what else is in a batch changes nothing."""
-    network, ball = lively("parts").eval(), noisy(sphere(subdivisions=4), 0.003)
-    sources = [Mesh(ball.vertices, ball.faces[::-1]), Mesh(ball.vertices[::-1], NO_FACES)]
-    together = transferred(network, sources, [ball] * 2)
-    mesh, points = (transferred(network, [source], [ball])[0] for source in sources)
-    torch.testing.assert_close(together, torch.stack([mesh, points]), atol=1e-5, rtol=1e-4)
-    monkeypatch.setattr(mesh_reading, "_MOST_POINTS", MOST_SAMPLED)
-    assert torch.equal(transferred(network, sources[:1], [ball])[0], mesh)
-    assert (transferred(network, sources[1:], [ball])[0] - points).abs().max() > 1e-4, "else this shows nothing"
 
 
 @pytest.mark.parametrize(("subdivisions", "times"), [(2, 2), (3, 8), (4, 8), (5, 17)])

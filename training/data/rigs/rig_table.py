@@ -23,13 +23,14 @@ from training.data.triples import Triples
 from training.networks.execution import sent
 from training.networks.layers import rigid_parts
 from training.networks.layers.rigid_parts import ancestors, moved_joints
-from training.networks.layers.sampling import MOST_SAMPLED
 from training.networks.layers.surface import Surface, joined, surface_of
 from training.objectives.parts import Posed
 
 _OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 _OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
 
+_DENSE = 1024
+"""Vertices of a mesh of which a subset is drawn by area, where there are more."""
 _SURFACES = 64
 """In so many poses surfaces are found, of all kinds of bodies together; of more kinds in one pose each."""
 
@@ -109,8 +110,8 @@ class RigTable:
         """How likely vertices of the sources [b, n] and of the targets are to be drawn, in any unit.
 
         By the share of the area at rest around each, of the first identity with the same weights: of dense meshes a
-        network's sample leaves out most in faces and hands, too. All alike in meshes of no more vertices than that
-        sample, and of points, which lie evenly. None: so are all meshes.
+        network's sample leaves out most in faces and hands, too. All alike in meshes of no more than 1,024
+        vertices, and of points, which lie evenly. None: so are all meshes.
         """
         source, target = batch.points or (None, None)
         return (
@@ -122,7 +123,7 @@ class RigTable:
         self, identities: NDArray[np.integer], vertices: Tensor, rows: Tensor | None, points: SurfacePoints | None
     ) -> Tensor | None:
         own = self._rows(identities)
-        dense = (self._counts[own] > MOST_SAMPLED) & ~np.array(points.drawn if points else [False] * len(own))
+        dense = (self._counts[own] > _DENSE) & ~np.array(points.drawn if points else [False] * len(own))
         if not dense.any():
             return None
         about = np.stack([self._of_weights[own], self._counts[own] - 1, dense])

@@ -24,8 +24,9 @@ _CELL = 1 / 32
 than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
-MOST_SAMPLED = 1024
-"""Vertices of a mesh that are sampled at most, where nothing else is said."""
+MOST_SAMPLED = 2048
+"""Vertices of a mesh that are sampled at most. By half as many dense meshes have a fifth more error
+(docs/results/parts.md)."""
 _AT_ONCE, _REGION = 512, 0.25
 """So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
 longest edge of a mesh' box being 1."""
@@ -138,12 +139,9 @@ def vertex_masses(vertices: Tensor) -> Tensor:
     return 1 / near / (1 / near).sum(dim=1, keepdim=True) + broken
 
 
-def sample(vertices: Tensor, surface: Surface | None = None, most: Tensor | None = None) -> Sample:
-    """Return some vertices [b, k, 3] of meshes [b, n, 3], whatever the vertices' order (but for ties).
-
-    ``most``: how many at most of each mesh [b], on the CPU; by default `MOST_SAMPLED`.
-    """
-    rows, chosen = _thinned(vertices.detach(), surface, most)
+def sample(vertices: Tensor, surface: Surface | None = None) -> Sample:
+    """Return some vertices [b, k, 3] of meshes [b, n, 3], whatever the vertices' order (but for ties)."""
+    rows, chosen = _thinned(vertices.detach(), surface)
     apart = None if surface is None else surface.apart(rows)
     drawn = _with_masses(rows, taken(vertices, rows), chosen, surface, apart)
     broken = vertices.detach().sum((1, 2), keepdim=True) * 0  # not a number where one is, in the sample or not
@@ -157,10 +155,10 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> tuple[Tensor, Tensor]:
+def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
-    Of more cells than the sample takes (``most`` [b], or `MOST_SAMPLED`), those are taken whose vertex is nearest to
+    Of more cells than the sample takes (`MOST_SAMPLED`), those are taken whose vertex is nearest to
     the middle: on a body they lie more evenly than a draw (docs/results/parts.md), but flat faces along the grid may be
     left out as a whole. Layers of a surface that touch have cells of their own.
     """
@@ -177,14 +175,10 @@ def _thinned(vertices: Tensor, surface: Surface | None, most: Tensor | None) -> 
     first = torch.ones_like(ordered, dtype=torch.bool)
     first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
     off = off.gather(1, order)
-    limit = MOST_SAMPLED if most is None else int(most.amax())
     # of a min() torch.export would understand less
-    count = vertices.shape[1] if vertices.shape[1] <= limit else limit
+    count = vertices.shape[1] if vertices.shape[1] <= MOST_SAMPLED else MOST_SAMPLED
     kept = torch.where(first, -off, -9.0).topk(count, dim=1)
-    chosen = kept.values > -9
-    if most is not None:
-        chosen = chosen & (torch.arange(count, device=chosen.device) < most.to(chosen.device)[:, None])
-    return order.gather(1, kept.indices), chosen
+    return order.gather(1, kept.indices), kept.values > -9
 
 
 def _with_masses(
