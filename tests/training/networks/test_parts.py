@@ -104,8 +104,8 @@ def test_vertices_beyond_the_sample_hear_what_they_would_of_all_of_it(
 ) -> None:
     network = lively("parts").double()
     assert isinstance(network, Parts)
-    vertices = 2.3 * torch.cat([sphere(3000, upper=0.8), sphere(3000, upper=0.3, seed=1)]).double()
-    surface = Surface(torch.zeros(2, 3000, dtype=torch.long), torch.ones(2, 1, 1, dtype=torch.bool)) if told else None
+    vertices = 2.3 * torch.cat([sphere(5000, upper=0.8), sphere(5000, upper=0.3, seed=1)]).double()
+    surface = Surface(torch.zeros(2, 5000, dtype=torch.long), torch.ones(2, 1, 1, dtype=torch.bool)) if told else None
     drawn = sample(vertices, surface)
     found = network.read(drawn, vertices)
     assert all(around.near.shape[2] < MOST_SAMPLED for _, around in others(vertices, drawn)), (
@@ -177,7 +177,7 @@ class KnownRig(Parts):
         return self.known[vertices is None]
 
 
-@pytest.mark.parametrize("count", [300, 1500])
+@pytest.mark.parametrize("count", [300, 2500])
 def test_a_target_is_read_again_at_rest(count: int) -> None:
     random, names = np.random.default_rng(0), {"a": None, "b": "a", "c": "b", "d": "a", "e": "d"}
     network = KnownRig(joints=names, width=8, token_width=8, blocks=1).double().eval()
@@ -220,7 +220,7 @@ def test_a_target_is_read_again_at_rest(count: int) -> None:
 def test_a_graph_of_it_has_no_breaks() -> None:
     network = lively("parts", blocks=1).train()
     whole = torch.compile(network, fullgraph=True, backend="eager")
-    for count in (300, 1500):
+    for count in (300, 2500):
         given = {"source": meshes(count, seed=1), "target": meshes(count, seed=2)}
         torch.testing.assert_close(whole(**given), network(**given), rtol=0, atol=1e-5)
 
