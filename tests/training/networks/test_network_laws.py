@@ -26,6 +26,7 @@ from tests.support.three_networks import (
 )
 from training.networks import NETWORKS, network_from
 from training.networks.layers import modulation, optimal_transport, pose_encoder
+from training.networks.layers.sampling import MOST_SAMPLED
 from training.recipes.networks import NETWORK_NAMES, CoreNet3dRecipe, DsffnetRecipe, NetworkRecipe, NptRecipe
 
 ABLATIONS: dict[str, dict[str, Any]] = {
@@ -268,7 +269,7 @@ def test_under_autocast_the_result_stays_close_and_float32(name: str, start: Any
 def test_export_gives_the_same_output_for_other_vertex_numbers(name: str) -> None:
     network = network_of(name, torch.float32, **({"blocks": 1} if name == "parts" else {})).eval()
     example, other = (pair_of(name, torch.float32, **counts) for counts in ({}, {"source": 41, "target": 17}))
-    least, most = (3, 1024) if name == "parts" else (2, 10_000)  # beyond that parts reads a sample of fixed size
+    least, most = (3, MOST_SAMPLED) if name == "parts" else (2, 10_000)  # beyond that parts samples as many
     source, target = (torch.export.Dim(f"{key}_vertices", min=least, max=most) for key in example)
     free = {"source": {1: target if plain(name) == PAIRING else source}, "target": {1: target}}
     exported = torch.export.export(network, (), example, dynamic_shapes=free).module()

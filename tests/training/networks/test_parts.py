@@ -244,7 +244,7 @@ def test_export_takes_meshes_that_are_more_than_their_samples() -> None:
 
 
 def test_a_mesh_that_is_its_own_sample_is_passed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    network, vertices, passed = lively("parts"), meshes(1024, seed=3), []
+    network, vertices, passed = lively("parts"), meshes(MOST_SAMPLED, seed=3), []
     assert isinstance(network, Parts)
     once = network._passed
 
@@ -255,7 +255,7 @@ def test_a_mesh_that_is_its_own_sample_is_passed_once(monkeypatch: pytest.Monkey
     monkeypatch.setattr(network, "_passed", counted)
     drawn = sample(vertices)
     assert torch.equal(taken(network.read(drawn, vertices).rest, drawn.rows), network.read(drawn).rest)
-    assert passed == [1024, 1024]
+    assert passed == [MOST_SAMPLED] * 2
 
 
 def test_parts_that_are_not_turned_leave_the_mesh_in_its_box() -> None:

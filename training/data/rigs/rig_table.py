@@ -30,7 +30,8 @@ _OF_SOURCES = Purpose.AS_SOURCE_POINTS, Purpose.SOURCE_POINTS
 _OF_TARGETS = Purpose.AS_TARGET_POINTS, Purpose.TARGET_POINTS
 
 _DENSE = 1024
-"""Vertices of a mesh of which a subset is drawn by area, where there are more."""
+"""Vertices of a mesh of which a subset is drawn by area, where there are more; as many as were sampled when the weights
+that come along were trained."""
 _SURFACES = 64
 """In so many poses surfaces are found, of all kinds of bodies together; of more kinds in one pose each."""
 
