@@ -25,7 +25,7 @@ than the rest, no more. Cells of 1/16 cost up to an eighth of the accuracy."""
 _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 MOST_SAMPLED = 2048
-"""Vertices of a mesh that are sampled at most. By half as many dense meshes have a fifth more error
+"""Vertices of a mesh that are sampled at most. By half as many dense meshes have an eighth to a quarter more error
 (docs/results/parts.md)."""
 _AT_ONCE, _REGION = 512, 0.25
 """So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
