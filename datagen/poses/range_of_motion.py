@@ -56,6 +56,12 @@ ARM = (
     Motion(("left_wrist",), X, x=(-45, 45), y=(-25, 25), z=(-65, 55)),
     Motion(("left_hand",), X, y=(-10, 10), z=(-80, 10)),
 )
+FOLDED_ARM = (  # as one crosses the arms, covers the face or rests the chin on a hand
+    ARM[0],
+    Motion(("left_shoulder",), X, x=(-60, 60), y=(-110, -10), z=(-95, 45)),
+    Motion(("left_elbow",), X, x=(-30, 30), y=(-150, -95)),
+    *ARM[3:],
+)
 LEG = (
     Motion(("left_hip",), Y, x=(-125, 30), y=(-40, 40), z=(-20, 45)),
     Motion(("left_knee",), Y, x=(0, 145), y=(-10, 10)),
@@ -68,13 +74,15 @@ FOLDED_LEG = (  # as one squats, sits on the heels or hugs the knees: weight or 
     *LEG[2:],
 )
 
-_TRUNK, _ARMS, _LEGS, _FOLDED_LEGS = (  # limbs, their sides, and the power of a uniform number that their share is
+# limbs, their sides, and the power of a uniform number that their share is
+_TRUNK, _ARMS, _FOLDED_ARMS, _LEGS, _FOLDED_LEGS = (
     (TRUNK, ("left",), 1.0),
     (ARM, ("left", "right"), 0.0),
+    (FOLDED_ARM, ("left", "right"), 0.0),
     (LEG, ("left", "right"), 0.5),
     (FOLDED_LEG, ("left", "right"), 0.0),
 )
-_SHARE_FOLDED = 1 / 6  # of poses: both legs are folded tightly
+_SHARE_FOLDED = 1 / 6  # of poses: both arms are folded tightly, and likewise both legs
 _ALIKE = 1 / 3  # of poses: both arms do the same, and likewise both legs
 
 
@@ -82,7 +90,8 @@ class AnatomicalSource:
     """See :class:`datagen.poses.PoseSource`: each limb by a share of its range, over SMPL's joints.
 
     The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
-    arms hang, reach and fold; in a sixth of the poses both legs are folded tightly, by the whole of narrower ranges.
+    arms hang, reach and fold; in a sixth of the poses both legs, and independently in a sixth both arms, are folded
+    tightly, by the whole of narrower ranges.
     In a third of the poses both arms do the same, and independently in a third both legs.
     Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
     ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
@@ -102,7 +111,8 @@ class AnatomicalSource:
             return npt_pose(("bent", "straight")[pose % 2], random)
         rotations = np.zeros((len(JOINTS), 3))
         legs = _FOLDED_LEGS if random.uniform() < _SHARE_FOLDED else _LEGS
-        for limb, sides, power in (_TRUNK, _ARMS, legs):
+        arms = _FOLDED_ARMS if random.uniform() < _SHARE_FOLDED else _ARMS
+        for limb, sides, power in (_TRUNK, arms, legs):
             alike, turned = random.uniform() < _ALIKE, list[NDArray[np.float64]]()
             for side in sides:
                 if not turned or not alike:

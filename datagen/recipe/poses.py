@@ -19,7 +19,7 @@ class NptPoses(Frozen):
 
 
 class AnatomicalPoses(Frozen):
-    """People's whole range of motion: bent trunks, turned heads, folded arms, legs folded tightly in a sixth."""
+    """People's whole range of motion: bent trunks, turned heads, arms folded tightly in a sixth, legs likewise."""
 
     name: Literal["anatomical"] = "anatomical"
     npt: float = Field(0.0, ge=0, le=1, description="share of the poses, by chance, that are drawn as npt's are")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datagen.poses import JOINTS, draw_poses, load_poses
-from datagen.poses.range_of_motion import ARM, FOLDED_LEG, LEG, TRUNK, Motion
+from datagen.poses import JOINTS, draw_poses, load_poses, range_of_motion
+from datagen.poses.range_of_motion import ARM, FOLDED_ARM, FOLDED_LEG, LEG, TRUNK, Motion
 from datagen.recipe import AnatomicalPoses, PoseRecipe
 
 RECIPE = PoseRecipe(seen=600, unseen=200, distribution=AnatomicalPoses())
@@ -20,7 +20,8 @@ def degrees() -> np.ndarray:
 def test_every_joint_but_the_pelvis_moves_and_each_has_one_motion(degrees: np.ndarray) -> None:
     still = [name for joint, name in enumerate(JOINTS) if not degrees[:, joint].any()]
     assert still == ["pelvis"]
-    assert [motion.joints for motion in FOLDED_LEG] == [motion.joints for motion in LEG]
+    for folded, limb in ((FOLDED_ARM, ARM), (FOLDED_LEG, LEG)):
+        assert [motion.joints for motion in folded] == [motion.joints for motion in limb]
     named = [joint for motion in (*TRUNK, *ARM, *LEG) for joint in motion.joints]
     assert sorted(named) == sorted(joint for joint in JOINTS if not joint.startswith(("right", "pelvis")))
 
@@ -31,7 +32,9 @@ def test_hinges_fill_their_range_and_stay_inside(degrees: np.ndarray) -> None:
     stretched = knee[degrees[:, JOINTS.index("left_hip"), 0] > -60]
     assert 125 < stretched.max() < 147, "of legs that are not folded one of up to 145"
     elbow = degrees[:, JOINTS.index("left_elbow"), 1]
-    assert -148 < elbow.min() < -125 and elbow.max() <= 1
+    assert -155 < elbow.min() < -140 and elbow.max() <= 1
+    raised = elbow[degrees[:, JOINTS.index("left_shoulder"), 1] > 0]
+    assert -147 < raised.min() < -120, "of arms that are not folded one of up to 145"
 
 
 def test_the_right_side_mirrors_the_left_ones_ranges(degrees: np.ndarray) -> None:
@@ -48,6 +51,21 @@ def test_both_legs_are_folded_tightly_in_a_sixth_of_the_poses(degrees: np.ndarra
     )
     tightly = ((hips < -65) & (knees > 90)).all(axis=1)
     assert abs(tightly.mean() - (1 / 6 + 5 / 6 * 0.02)) < 0.015, "independent legs seldom are"
+
+
+def test_both_arms_are_folded_tightly_in_a_sixth_independently_of_the_legs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(range_of_motion, "_ARMS", (ARM[:2], ("left", "right"), 0.0))  # elbows that are straight
+    sixty_more = RECIPE.model_copy(update={"seen": 660})  # poses are remembered by their recipe
+    degrees = np.degrees(draw_poses(sixty_more, range(800)).rotations)
+    elbows, shoulders = (
+        np.stack([-degrees[:, JOINTS.index(f"left_{joint}"), 1], degrees[:, JOINTS.index(f"right_{joint}"), 1]])
+        for joint in ("elbow", "shoulder")
+    )
+    folded = (elbows > 90).all(axis=0)
+    assert np.array_equal(folded, (elbows != 0).any(axis=0)) and abs(folded.mean() - 1 / 6) < 0.03
+    assert shoulders[:, folded].min() > -15 and shoulders.min() < -20, "before the body, where others go behind it"
+    legs = (degrees[:, [JOINTS.index(f"{side}_knee") for side in ("left", "right")], 0] > 90).all(axis=1)
+    assert abs((folded & legs).mean() - folded.mean() * legs.mean()) < 0.015
 
 
 def test_joints_of_a_chain_share_its_motion_equally(degrees: np.ndarray) -> None:
