@@ -32,6 +32,7 @@ from training.networks.layers.rigid_parts import (
     mirrored,
     moved_joints,
     nearest_rotations,
+    neighbours,
     other_side,
     rotations_from_six,
     skinned,
@@ -41,9 +42,9 @@ from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
-_LEAST_NEAR = 0.07
-"""Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part
-(docs/results/parts.md)."""
+_LEAST_NEAR, _HELD = 0.07, 0.25
+"""Shares of a part's surface: so much of a part has to lie near a vertex, along the surface, for the vertex to follow
+it, and near what is near so much of a part that it hangs on (docs/results/parts.md)."""
 
 
 class Reading(NamedTuple):
@@ -131,6 +132,7 @@ class Parts(nn.Module):
     takes_surfaces = True
     parents: Tensor
     above: Tensor
+    next_to: Tensor
     other_side: Tensor | None
     upright: Tensor
 
@@ -147,6 +149,7 @@ class Parts(nn.Module):
         own = [part if parent < 0 else parent for part, parent in enumerate(parents)]
         self.register_buffer("parents", torch.tensor(own), persistent=False)
         self.register_buffer("above", ancestors(parents), persistent=False)
+        self.register_buffer("next_to", neighbours(own), persistent=False)
         self.register_buffer("other_side", other_side(self.joints), persistent=False)
         self.register_buffer("upright", torch.tensor([1.0, 0, 0, 0, 1, 0]), persistent=False)
         self.lift = nn.Linear(6, 64)
@@ -216,7 +219,7 @@ class Parts(nn.Module):
             found = self.read_again(drawn, of_all._replace(logits=taken(of_all.logits, drawn.rows)))
             is_its_sample = drawn.rows.shape == of_all.logits.shape[:2]
             logits = taken(found.logits, drawn.rows.argsort(dim=1)) if is_its_sample else of_all.logits
-            return ReadTarget(target, read, drawn, _weights(logits, drawn), found.rotations, found.joints)
+            return ReadTarget(target, read, drawn, _weights(logits, drawn, self.next_to), found.rotations, found.joints)
 
     def posed_target(
         self,
@@ -277,6 +280,10 @@ class Parts(nn.Module):
 
     def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
+        if drawn.surface is not None:
+            cells = drawn.surface.cells.gather(1, drawn.rows)
+            near = _near_parts(reading.logits, drawn.surface, cells, drawn.masses, self.next_to)
+            reading = reading._replace(logits=_of_near(reading.logits, near, cells))
         rest = self.posed_to_rest(drawn.vertices, reading)
         found = self.read(drawn.moved(rest.vertices))
         return found, rest.half * found.joints + rest.middle - rest.joints
@@ -328,7 +335,7 @@ class Parts(nn.Module):
         """Return weights [b, n, part] of vertices [b, n, 3] of meshes with such a sample, as they are first read."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn)
+        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn, self.next_to)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -487,21 +494,39 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
 
 
-def _weights(logits: Tensor, drawn: Sample) -> Tensor:
-    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near.
-
-    A few vertices of a back that are taken for an upper arm's would fly away with it. How much of a part is near along
-    the surface is told by the masses of the sample, however finely the mesh is meshed there.
-    """
-    weights, surface = logits.softmax(2), drawn.surface
+def _weights(logits: Tensor, drawn: Sample, next_to: Tensor) -> Tensor:
+    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near."""
+    surface = drawn.surface
     if surface is None:
-        return weights
-    shares = taken(weights, drawn.rows) * drawn.masses[..., None]
-    cells = surface.cells.gather(1, drawn.rows)[..., None].expand_as(shares)
-    held = weights.new_zeros(*surface.near.shape[:2], weights.shape[2]).scatter_add(1, cells, shares)
-    is_near = surface.near.to(held.dtype) @ held >= _LEAST_NEAR * held.sum(1, keepdim=True)
-    is_near = is_near | ~is_near.any(2, keepdim=True)
-    return logits.masked_fill(~is_near.gather(1, surface.cells[..., None].expand_as(weights)), -torch.inf).softmax(2)
+        return logits.softmax(2)
+    cells = surface.cells.gather(1, drawn.rows)
+    near = _near_parts(taken(logits, drawn.rows), surface, cells, drawn.masses, next_to)
+    return _of_near(logits, near, surface.cells).softmax(2)
+
+
+def _near_parts(logits: Tensor, surface: Surface, cells: Tensor, masses: Tensor, next_to: Tensor) -> Tensor:
+    """Which parts the vertices of each cell [b, cell, part] may follow, by the logits of a sample's [b, k, part].
+
+    A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left foot that
+    lies at the right knee and is taken for the right one, but hangs on no right shank. How much of a part is near along
+    the surface is told by the masses of the sample, however finely the mesh is meshed there. It is asked twice: a shank
+    that was taken for the wrong one holds no foot any more.
+    """
+    beside = surface.near.to(logits.dtype)
+    near = beside.new_ones(*beside.shape[:2], logits.shape[2], dtype=torch.bool)
+    for _ in range(2):
+        shares = _of_near(logits, near, cells).softmax(2) * masses[..., None]
+        held = shares.new_zeros(near.shape).scatter_add(1, cells[..., None].expand_as(shares), shares)
+        share = beside @ held / held.sum(1, keepdim=True).clamp_min(1e-12)
+        hangs = beside @ ((share >= _HELD).to(share.dtype) @ next_to) > 0
+        near = (share >= _LEAST_NEAR) & hangs
+        near = near | ~near.any(2, keepdim=True)
+    return near
+
+
+def _of_near(logits: Tensor, near: Tensor, cells: Tensor) -> Tensor:
+    """Logits [b, n, part] of vertices of these cells [b, n], of parts that are near their cells [b, cell, part]."""
+    return logits.masked_fill(~near.gather(1, cells[..., None].expand_as(logits)), -torch.inf)
 
 
 class _Moments(NamedTuple):

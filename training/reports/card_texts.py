@@ -60,7 +60,8 @@ POSES = {
     "npt": "drawn per joint from uniform ranges, as Neural Pose Transfer's generator draws them: joints are "
     "independent, so there are poses that nobody takes, and limbs may go through the body",
     "anatomical": "drawn per joint from people's ranges of motion: joints are independent, but for arms and "
-    "legs folded together and limbs that do alike, so there are poses that nobody takes, and limbs may go through the body",
+    "legs folded together and limbs that do alike, so there are poses that nobody takes, and limbs may go through the "
+    "body",
     "ranges": "drawn per joint from uniform ranges of the recipe's own: joints are independent, so there may be poses "
     "that nobody takes",
     "clips": "moments of the animation clips of rigged characters",

@@ -105,6 +105,12 @@ def ancestors(parents: Sequence[int]) -> Tensor:
     return above
 
 
+def neighbours(parents: Sequence[int]) -> Tensor:
+    """Return [part, part] float32: more than 0 where one hangs on the other; a root, whose parent it is, on itself."""
+    on = torch.eye(len(parents))[list(parents)]
+    return on + on.T
+
+
 def moved_joints(joints: Tensor, rotations: Tensor, parents: Tensor, above: Tensor) -> Tensor:
     """Return where joints [b, part, 3] go when every part is turned [b, part, 3, 3] about its own; roots stay.
 

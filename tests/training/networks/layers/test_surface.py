@@ -12,6 +12,7 @@ from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks import parts
 from training.networks.layers import sampling
+from training.networks.layers.rigid_parts import neighbours
 from training.networks.layers.sampling import Sample, sample
 from training.networks.layers.surface import Surface, _Cells, joined, of_cells, surface_of
 from training.networks.parts import Parts
@@ -249,6 +250,10 @@ def test_crumbs_are_one_cell_that_is_near_to_all() -> None:
     assert (found == near(mesh)).all()
 
 
+ALL = torch.ones(3, 3)
+"""Three parts of which each hangs on each."""
+
+
 def two_parts(mesh: Mesh, few: slice) -> torch.Tensor:
     """Logits [1, n, 3] of a hairpin's strips, a part each; the shares of a few vertices of the first are exchanged."""
     logits = torch.tensor([4.0, 0.0, 2.0]).repeat(len(mesh.vertices), 1)
@@ -264,8 +269,8 @@ def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it
     mesh, few = hairpin(joined_at_the_end=joined_at_the_end), slice(3, 6)
     vertices, half = torch.from_numpy(mesh.vertices).float()[None], len(mesh.vertices) // 2
     logits, drawn = two_parts(mesh, few), sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
-    weights, as_read = parts._weights(logits, drawn)[0], logits.softmax(2)[0]
-    assert torch.equal(parts._weights(logits, sample(vertices))[0], as_read)
+    weights, as_read = parts._weights(logits, drawn, ALL)[0], logits.softmax(2)[0]
+    assert torch.equal(parts._weights(logits, sample(vertices), ALL)[0], as_read)
     if not joined_at_the_end:
         assert torch.equal(weights, as_read), "what no edge joins may be of one part"
         return
@@ -274,8 +279,42 @@ def test_vertices_far_from_the_rest_of_a_part_along_the_surface_do_not_follow_it
     others = torch.tensor([vertex for vertex in range(half) if vertex not in range(*few.indices(half))])
     assert weights[others].argmax(1).eq(0).all() and weights[half:].argmax(1).eq(1).all()
     monkeypatch.setattr(parts, "_LEAST_NEAR", 0.6)
-    nowhere = parts._weights(logits, drawn)[0]
+    nowhere = parts._weights(logits, drawn, ALL)[0]
     assert nowhere.isfinite().all() and torch.equal(nowhere[: half // 10], as_read[: half // 10]), "no part is near"
+
+
+def legs(mesh: Mesh) -> torch.Tensor:
+    """The part [n] of each vertex of a hairpin: 0, the pelvis, where its strips are one, thigh, shank and foot along
+    each, 1 to 3 and 4 to 6.
+    """
+    part = torch.from_numpy(3 - np.digitize(mesh.vertices[:, 0], (-0.5, 0.1, 0.7)))
+    return torch.where((part > 0) & (torch.arange(len(part)) >= len(part) // 2), part + 3, part)
+
+
+@pytest.mark.parametrize(
+    ("shank", "foot"),
+    [
+        pytest.param(0.0, 0.5, id="a foot"),
+        pytest.param(0.26, 0.125, id="too little of a foot to hold the third of a shank that it hangs on"),
+    ],
+)
+def test_what_lies_at_the_other_leg_and_hangs_on_none_of_its_parts_is_not_of_that_leg(
+    shank: float, foot: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The left leg's vertices from a foot's way below the ankle to a shank's way above it are taken for the right's."""
+    mesh = hairpin()
+    true, next_to = legs(mesh), neighbours([0, 0, 1, 2, 0, 4, 5])
+    x = torch.from_numpy(mesh.vertices[:, 0])
+    wrong = (true > 0) & (true < 4) & (x > -0.5 - foot - 0.01) & (x < -0.5 + shank)
+    assert wrong.sum() > 20
+    logits = 2 * torch.eye(7)[true] + 4 * torch.eye(7)[torch.where(wrong, true + 3, true)]
+    drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
+    weights = parts._weights(logits[None], drawn, next_to)[0]
+    assert torch.equal(weights.argmax(1), true) and weights[wrong].gather(1, true[wrong, None] + 3).eq(0).all()
+    assert torch.equal(weights[true >= 4].argmax(1), true[true >= 4])
+    monkeypatch.setattr(parts, "_HELD", 0.0)
+    by_what_is_near = parts._weights(logits[None], drawn, next_to)[0]
+    assert by_what_is_near[wrong].argmax(1).ge(4).all(), "else this shows nothing"
 
 
 def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -> None:
@@ -291,7 +330,7 @@ def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -
     logits[far, 1] = 2
     drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
     assert far.float().mean() < parts._LEAST_NEAR, "else this shows nothing"
-    torch.testing.assert_close(parts._weights(logits[None], drawn)[0], logits.softmax(1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(parts._weights(logits[None], drawn, ALL)[0], logits.softmax(1), rtol=0, atol=1e-4)
 
 
 @torch.no_grad()
@@ -303,7 +342,8 @@ def test_targets_and_projections_are_posed_by_parts_that_are_near(monkeypatch: p
     drawn = sample(vertices, surface)
     asked = list[Sample]()
 
-    def weights_of(logits: torch.Tensor, drawn: Sample) -> torch.Tensor:
+    def weights_of(logits: torch.Tensor, drawn: Sample, next_to: torch.Tensor) -> torch.Tensor:
+        assert next_to is network.next_to
         asked.append(drawn)
         return torch.zeros_like(logits)
 
