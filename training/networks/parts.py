@@ -5,7 +5,8 @@ weights of every vertex, rotations and joints of the parts, and where each verte
 target's parts are turned as the source's are, its skeleton takes its joints along, and its vertices follow by linear
 blend skinning. That is learned from what the papers' networks are not told: weights, joints and rotations of bodies
 that have a rig (:mod:`training.objectives.parts`). Where faces are known, vertices hear only of what is near along the
-surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is not taken for the thigh's.
+surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is not taken for the thigh's; and they
+follow no part that is not near so, nor one of whose neighbours in the skeleton none is.
 
     read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
 
@@ -42,9 +43,9 @@ from training.networks.layers.surface import Surface, joined
 from training.recipes.networks import PEOPLE
 
 _VARIANCE_FLOOR = 1e-5
-_LEAST_NEAR, _HELD = 0.07, 0.25
-"""Shares of a part's surface: so much of a part has to lie near a vertex, along the surface, for the vertex to follow
-it, and near what is near so much of a part that it hangs on (docs/results/parts.md)."""
+_LEAST_NEAR, _LEAST_HOLDING = 0.07, 0.25
+"""Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part; and
+how much of one that it hangs on, near what is near, of the most that lies near any place (docs/results/parts.md)."""
 
 
 class Reading(NamedTuple):
@@ -281,9 +282,8 @@ class Parts(nn.Module):
     def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
         if drawn.surface is not None:
-            cells = drawn.surface.cells.gather(1, drawn.rows)
-            near = _near_parts(reading.logits, drawn.surface, cells, drawn.masses, self.next_to)
-            reading = reading._replace(logits=_of_near(reading.logits, near, cells))
+            near = _near_parts(reading.logits, drawn.surface.at(drawn.rows), drawn.masses, self.next_to)
+            reading = reading._replace(logits=_of_near(reading.logits, near, drawn.surface.at(drawn.rows)))
         rest = self.posed_to_rest(drawn.vertices, reading)
         found = self.read(drawn.moved(rest.vertices))
         return found, rest.half * found.joints + rest.middle - rest.joints
@@ -495,38 +495,38 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _weights(logits: Tensor, drawn: Sample, next_to: Tensor) -> Tensor:
-    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near."""
-    surface = drawn.surface
-    if surface is None:
+    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near, or held by
+    no other.
+    """
+    if drawn.surface is None:
         return logits.softmax(2)
-    cells = surface.cells.gather(1, drawn.rows)
-    near = _near_parts(taken(logits, drawn.rows), surface, cells, drawn.masses, next_to)
-    return _of_near(logits, near, surface.cells).softmax(2)
+    near = _near_parts(taken(logits, drawn.rows), drawn.surface.at(drawn.rows), drawn.masses, next_to)
+    return _of_near(logits, near, drawn.surface).softmax(2)
 
 
-def _near_parts(logits: Tensor, surface: Surface, cells: Tensor, masses: Tensor, next_to: Tensor) -> Tensor:
-    """Which parts the vertices of each cell [b, cell, part] may follow, by the logits of a sample's [b, k, part].
+def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, next_to: Tensor) -> Tensor:
+    """Which parts the vertices of each cell [b, cell, part] may follow, by a sample's logits [b, k, part]; none: all.
 
     A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left foot that
     lies at the right knee and is taken for the right one, but hangs on no right shank. How much of a part is near along
-    the surface is told by the masses of the sample, however finely the mesh is meshed there. It is asked twice: a shank
-    that was taken for the wrong one holds no foot any more.
+    the surface is told by the masses of the sample [b, k], however finely the mesh is meshed there. It is asked twice:
+    a shank that was taken for the wrong one holds no foot any more.
     """
-    beside = surface.near.to(logits.dtype)
-    near = beside.new_ones(*beside.shape[:2], logits.shape[2], dtype=torch.bool)
+    beside, along = (each.to(logits.dtype) for each in (surface.near, surface.along()))
+    near = torch.ones_like(beside[..., :1], dtype=torch.bool).expand(-1, -1, logits.shape[2])
     for _ in range(2):
-        shares = _of_near(logits, near, cells).softmax(2) * masses[..., None]
-        held = shares.new_zeros(near.shape).scatter_add(1, cells[..., None].expand_as(shares), shares)
-        share = beside @ held / held.sum(1, keepdim=True).clamp_min(1e-12)
-        hangs = beside @ ((share >= _HELD).to(share.dtype) @ next_to) > 0
-        near = (share >= _LEAST_NEAR) & hangs
+        shares = _of_near(logits, near, surface).softmax(2) * masses[..., None]
+        in_cell = shares.new_zeros(near.shape).scatter_add(1, surface.cells[..., None].expand_as(shares), shares)
+        share = beside @ in_cell / in_cell.sum(1, keepdim=True).clamp_min(1e-12)
+        holds = share >= _LEAST_HOLDING * share.amax(1, keepdim=True)
+        near = (share >= _LEAST_NEAR) & (along @ (holds.to(share.dtype) @ next_to) > 0)
         near = near | ~near.any(2, keepdim=True)
     return near
 
 
-def _of_near(logits: Tensor, near: Tensor, cells: Tensor) -> Tensor:
-    """Logits [b, n, part] of vertices of these cells [b, n], of parts that are near their cells [b, cell, part]."""
-    return logits.masked_fill(~near.gather(1, cells[..., None].expand_as(logits)), -torch.inf)
+def _of_near(logits: Tensor, near: Tensor, surface: Surface) -> Tensor:
+    """Logits [b, n, part] of a surface's vertices, of parts that are near their cells [b, cell, part]."""
+    return logits.masked_fill(~near.gather(1, surface.cells[..., None].expand_as(logits)), -torch.inf)
 
 
 class _Moments(NamedTuple):

@@ -106,7 +106,8 @@ def _posed_to_rest(
     """Both meshes [b, n, 3] as their readings pose them to rest, and what of rotations and joints is missing there.
 
     What was read rightly is at rest then; a part that was misread is turned by what is missing. A joint lies on two
-    parts, and what was missed of it goes along with both, by halves.
+    parts, and what was missed of it goes along with both, by halves. Vertices follow all parts that they are taken
+    for, near or not, as what is near is asked outside of training alone.
     """
     found = list[tuple[Tensor, Posed]]()
     for vertices, reading, right in zip(meshes, readings, posed, strict=True):

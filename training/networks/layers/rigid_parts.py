@@ -106,7 +106,7 @@ def ancestors(parents: Sequence[int]) -> Tensor:
 
 
 def neighbours(parents: Sequence[int]) -> Tensor:
-    """Return [part, part] float32: more than 0 where one hangs on the other; a root, whose parent it is, on itself."""
+    """Return [part, part] float32: more than 0 where one hangs on the other; a root's parent is itself."""
     on = torch.eye(len(parents))[list(parents)]
     return on + on.T
 
