@@ -510,16 +510,17 @@ def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, next_to: Tenso
     A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left foot that
     lies at the right knee and is taken for the right one, but hangs on no right shank. How much of a part is near along
     the surface is told by the masses of the sample [b, k], however finely the mesh is meshed there. It is asked twice:
-    a shank that was taken for the wrong one holds no foot any more.
+    a shank that was taken for the wrong one holds no foot any more. Where a mesh is of several pieces, each of which is
+    near to all of the others, they hold whatever there is.
     """
-    beside, along = (each.to(logits.dtype) for each in (surface.near, surface.along()))
+    beside = surface.near.to(logits.dtype)
     near = torch.ones_like(beside[..., :1], dtype=torch.bool).expand(-1, -1, logits.shape[2])
     for _ in range(2):
         shares = _of_near(logits, near, surface).softmax(2) * masses[..., None]
         in_cell = shares.new_zeros(near.shape).scatter_add(1, surface.cells[..., None].expand_as(shares), shares)
         share = beside @ in_cell / in_cell.sum(1, keepdim=True).clamp_min(1e-12)
         holds = share >= _LEAST_HOLDING * share.amax(1, keepdim=True)
-        near = (share >= _LEAST_NEAR) & (along @ (holds.to(share.dtype) @ next_to) > 0)
+        near = (share >= _LEAST_NEAR) & (beside @ (holds.to(share.dtype) @ next_to) > 0)
         near = near | ~near.any(2, keepdim=True)
     return near
 

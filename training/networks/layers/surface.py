@@ -66,16 +66,6 @@ class Surface(NamedTuple):
         """Those of the vertices of these numbers [b, k] alone."""
         return Surface(self.cells.gather(1, rows), self.near)
 
-    def along(self) -> Tensor:
-        """Which cells [b, cell, cell] are near each other along the surface, and not for being of two pieces.
-
-        Nothing is far from two cells of different pieces, while on a body much is far from two that are near.
-        """
-        is_cell = self.near.diagonal(dim1=1, dim2=2)[:, None]  # what a batch is padded with is near nothing
-        far = (~self.near & is_cell).float()
-        itself = torch.eye(far.shape[1], dtype=torch.bool, device=far.device)
-        return self.near & ((far @ far.mT > 0) | itself)
-
     def apart(self, rows: Tensor) -> Tensor:
         """What the exponent of a Gaussian loses [b, cell, k] between a cell and the vertices of these numbers [b, k].
 
