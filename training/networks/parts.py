@@ -6,7 +6,7 @@ target's parts are turned as the source's are, its skeleton takes its joints alo
 blend skinning. That is learned from what the papers' networks are not told: weights, joints and rotations of bodies
 that have a rig (:mod:`training.objectives.parts`). Where faces are known, vertices hear only of what is near along the
 surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is not taken for the thigh's; and they
-follow no part that is not near so, nor one of whose neighbours in the skeleton none is.
+follow no part that is not near so, nor one of which no neighbour in the skeleton lies near what is near.
 
     read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
 
@@ -45,7 +45,8 @@ from training.recipes.networks import PEOPLE
 _VARIANCE_FLOOR = 1e-5
 _LEAST_NEAR, _LEAST_HOLDING = 0.07, 0.25
 """Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part; and
-how much of one that it hangs on, near what is near, of the most that lies near any place (docs/results/parts.md)."""
+how much of one that it hangs on, or that hangs on it, near what is near, of the most that lies near any place
+(docs/results/parts.md)."""
 
 
 class Reading(NamedTuple):
@@ -511,7 +512,7 @@ def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, next_to: Tenso
     lies at the right knee and is taken for the right one, but hangs on no right shank. How much of a part is near along
     the surface is told by the masses of the sample [b, k], however finely the mesh is meshed there. It is asked twice:
     a shank that was taken for the wrong one holds no foot any more. Where a mesh is of several pieces, each of which is
-    near to all of the others, they hold whatever there is.
+    near to all of the others, they hold whatever there is. A root holds itself, too.
     """
     beside = surface.near.to(logits.dtype)
     near = torch.ones_like(beside[..., :1], dtype=torch.bool).expand(-1, -1, logits.shape[2])

@@ -332,6 +332,11 @@ def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -
     torch.testing.assert_close(parts._weights(logits[None], drawn, ALL)[0], logits.softmax(1), rtol=0, atol=1e-4)
 
 
+def test_either_of_two_parts_that_hang_together_holds_the_other_and_a_root_itself() -> None:
+    expected = [[True, True, False], [True, False, True], [False, True, False]]
+    assert neighbours([0, 0, 1]).gt(0).tolist() == expected
+
+
 def test_a_part_too_large_to_lie_near_anything_holds_what_hangs_on_it() -> None:
     mesh = hairpin(60)
     vertices = torch.from_numpy(mesh.vertices).float()[None]
