@@ -91,8 +91,8 @@ class AnatomicalSource:
 
     The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
     arms hang, reach and fold; in a sixth of the poses both legs, and independently in a sixth both arms, are folded
-    tightly, by the whole of narrower ranges.
-    In a third of the poses both arms do the same, and independently in a third both legs.
+    tightly, by the whole of narrower ranges. In a third of the poses both arms do the same, and independently in a
+    third both legs.
     Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
     ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
     """

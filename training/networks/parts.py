@@ -283,8 +283,9 @@ class Parts(nn.Module):
     def _at_rest(self, drawn: Sample, reading: Reading) -> tuple[Reading, Tensor]:
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
         if drawn.surface is not None:
-            near = _near_parts(reading.logits, drawn.surface.at(drawn.rows), drawn.masses, self.next_to)
-            reading = reading._replace(logits=_of_near(reading.logits, near, drawn.surface.at(drawn.rows)))
+            sampled = drawn.surface.at(drawn.rows)
+            near = _near_parts(reading.logits, sampled, drawn.masses, self.next_to)
+            reading = reading._replace(logits=_of_near(reading.logits, near, sampled))
         rest = self.posed_to_rest(drawn.vertices, reading)
         found = self.read(drawn.moved(rest.vertices))
         return found, rest.half * found.joints + rest.middle - rest.joints
