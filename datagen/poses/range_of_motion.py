@@ -74,15 +74,10 @@ FOLDED_LEG = (  # as one squats, sits on the heels or hugs the knees: weight or 
     *LEG[2:],
 )
 
-# limbs, their sides, and the power of a uniform number that their share is
-_TRUNK, _ARMS, _FOLDED_ARMS, _LEGS, _FOLDED_LEGS = (
-    (TRUNK, ("left",), 1.0),
-    (ARM, ("left", "right"), 0.0),
-    (FOLDED_ARM, ("left", "right"), 0.0),
-    (LEG, ("left", "right"), 0.5),
-    (FOLDED_LEG, ("left", "right"), 0.0),
-)
-_SHARE_FOLDED = 1 / 6  # of poses: both arms are folded tightly, and likewise both legs
+_SIDES = ("left", "right")
+# limbs, the same folded tightly, their sides, and the power of a uniform number that their share is
+_TRUNK, _ARMS, _LEGS = (TRUNK, TRUNK, ("left",), 1.0), (ARM, FOLDED_ARM, _SIDES, 0.0), (LEG, FOLDED_LEG, _SIDES, 0.5)
+_FOLDED = 1 / 4  # of arms and legs: folded tightly; of trunks: bent by the whole
 _ALIKE = 1 / 3  # of poses: both arms do the same, and likewise both legs
 
 
@@ -90,9 +85,9 @@ class AnatomicalSource:
     """See :class:`datagen.poses.PoseSource`: each limb by a share of its range, over SMPL's joints.
 
     The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
-    arms hang, reach and fold; in a sixth of the poses both legs, and independently in a sixth both arms, are folded
-    tightly, by the whole of narrower ranges. In a third of the poses both arms do the same, and independently in a
-    third both legs.
+    arms hang, reach and fold. A quarter of the trunks bend by the whole, and of the arms and legs are folded tightly,
+    by the whole of narrower ranges. In a third of the poses both arms do the same, and independently in a third both
+    legs.
     Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
     ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
     """
@@ -110,14 +105,13 @@ class AnatomicalSource:
         if random.uniform() < self._npt:
             return npt_pose(("bent", "straight")[pose % 2], random)
         rotations = np.zeros((len(JOINTS), 3))
-        legs = _FOLDED_LEGS if random.uniform() < _SHARE_FOLDED else _LEGS
-        arms = _FOLDED_ARMS if random.uniform() < _SHARE_FOLDED else _ARMS
-        for limb, sides, power in (_TRUNK, arms, legs):
+        for limb, folded, sides, power in (_TRUNK, _ARMS, _LEGS):
             alike, turned = random.uniform() < _ALIKE, list[NDArray[np.float64]]()
             for side in sides:
                 if not turned or not alike:
-                    share = random.uniform() ** power
-                    turned = [motion.draw(random, share) for motion in limb]
+                    fold = random.uniform() < _FOLDED
+                    share = 1.0 if fold else random.uniform() ** power
+                    turned = [motion.draw(random, share) for motion in (folded if fold else limb)]
                 for motion, turn in zip(limb, turned, strict=True):
                     for joint in motion.joints:
                         rotations[JOINTS.index(joint.replace("left", side))] = turn * _MIRROR[side]

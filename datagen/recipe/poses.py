@@ -19,7 +19,7 @@ class NptPoses(Frozen):
 
 
 class AnatomicalPoses(Frozen):
-    """People's whole range of motion: bent trunks, turned heads, arms folded tightly in a sixth, legs likewise."""
+    """People's whole range of motion: bent trunks, turned heads, a quarter of arms and legs folded tightly."""
 
     name: Literal["anatomical"] = "anatomical"
     npt: float = Field(0.0, ge=0, le=1, description="share of the poses, by chance, that are drawn as npt's are")

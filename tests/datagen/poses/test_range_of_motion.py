@@ -45,27 +45,39 @@ def test_the_right_side_mirrors_the_left_ones_ranges(degrees: np.ndarray) -> Non
     assert np.allclose(np.quantile(left, 0.9, axis=0), np.quantile(right * [1, -1, -1], 0.9, axis=0), atol=9)
 
 
-def test_both_legs_are_folded_tightly_in_a_sixth_of_the_poses(degrees: np.ndarray) -> None:
-    hips, knees = (
-        degrees[:, [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")], 0] for joint in ("hip", "knee")
-    )
-    tightly = ((hips < -65) & (knees > 90)).all(axis=1)
-    assert abs(tightly.mean() - (1 / 6 + 5 / 6 * 0.02)) < 0.015, "independent legs seldom are"
-
-
-def test_both_arms_are_folded_tightly_in_a_sixth_independently_of_the_legs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(range_of_motion, "_ARMS", (ARM[:2], ("left", "right"), 0.0))  # elbows that are straight
+def test_a_quarter_of_the_arms_and_independently_of_the_legs_are_folded_tightly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, limb, folded, power in (("_ARMS", ARM[:3], FOLDED_ARM[:3], 0.0), ("_LEGS", LEG[:2], FOLDED_LEG[:2], 0.5)):
+        straight = (*limb[:-1], Motion(limb[-1].joints, limb[-1].bone))  # so that elbows and knees tell
+        monkeypatch.setattr(range_of_motion, name, (straight, folded, ("left", "right"), power))
     sixty_more = RECIPE.model_copy(update={"seen": 660})  # poses are remembered by their recipe
     degrees = np.degrees(draw_poses(sixty_more, range(800)).rotations)
-    elbows, shoulders = (
-        np.stack([-degrees[:, JOINTS.index(f"left_{joint}"), 1], degrees[:, JOINTS.index(f"right_{joint}"), 1]])
-        for joint in ("elbow", "shoulder")
-    )
-    folded = (elbows > 90).all(axis=0)
-    assert np.array_equal(folded, (elbows != 0).any(axis=0)) and abs(folded.mean() - 1 / 6) < 0.03
-    assert shoulders[:, folded].min() > -15 and shoulders.min() < -20, "before the body, where others go behind it"
-    legs = (degrees[:, [JOINTS.index(f"{side}_knee") for side in ("left", "right")], 0] > 90).all(axis=1)
-    assert abs((folded & legs).mean() - folded.mean() * legs.mean()) < 0.015
+
+    def of_sides(joint: str, axis: int, right: int) -> np.ndarray:
+        return np.stack(
+            [degrees[:, JOINTS.index(f"left_{joint}"), axis], right * degrees[:, JOINTS.index(f"right_{joint}"), axis]]
+        )
+
+    arms, legs = of_sides("elbow", 1, -1) < -90, of_sides("knee", 0, 1) > 90
+    for folded, hinges in ((arms, of_sides("elbow", 1, -1)), (legs, of_sides("knee", 0, 1))):
+        assert np.array_equal(folded, hinges != 0) and np.abs(folded.mean(axis=1) - 1 / 4).max() < 0.05
+        assert abs((folded[0] != folded[1]).mean() - 2 / 3 * 2 * 3 / 16) < 0.05, "one of them alone"
+    assert np.abs((arms & legs).mean(axis=1) - arms.mean(axis=1) * legs.mean(axis=1)).max() < 0.03
+    shoulders, hips = of_sides("shoulder", 1, -1), of_sides("hip", 0, 1)
+    assert shoulders[arms].max() < 15 and shoulders.max() > 20, "before the body, where others go behind it"
+    assert hips[legs].max() < -60 and hips.max() > 0
+
+
+def test_trunks_bend_by_a_share_of_their_range_and_a_quarter_by_the_whole(degrees: np.ndarray) -> None:
+    spine = Motion(("spine1",), TRUNK[0].bone, TRUNK[0].x, TRUNK[0].y, TRUNK[0].z)
+    whole = np.degrees([spine.draw(np.random.default_rng(seed), 1.0) for seed in range(2_000)])
+    far = np.linalg.norm(whole, axis=1)
+    bent = 3 * np.linalg.norm(degrees[:, JOINTS.index("spine1")], axis=1)
+    by_share = np.linalg.norm(whole * np.random.default_rng(0).uniform(size=(2_000, 1)), axis=1)
+    for least in (20, 40, 55):
+        expected = (far > least).mean() / 4 + (by_share > least).mean() * 3 / 4
+        assert abs((bent > least).mean() - expected) < 0.05
 
 
 def test_joints_of_a_chain_share_its_motion_equally(degrees: np.ndarray) -> None:
