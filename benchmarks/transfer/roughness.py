@@ -2,7 +2,7 @@
 
 The roughness by which a mesh is read through a low-pass filter or not (:meth:`datagen.mesh.low_pass.LowPass.roughness`)
 of the sources of datasets' evaluation triples, as they are, subdivided, clustered and simplified, without and with
-noise: least and greatest (docs/results/parts.md). A minute.
+noise: least and greatest (docs/results/parts-experiments.md). A minute.
 """
 
 from __future__ import annotations
