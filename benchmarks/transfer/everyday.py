@@ -32,6 +32,13 @@ from workflows.pretrained import weights_named
 _IN_A_PICTURE = 7
 _PANEL = (300, 300)
 
+PEOPLE: dict[str, tuple[float, AnnyTopology, int]] = {
+    "child": (0.25, "notoes_collapse5pc", 4),
+    "grown-up": (0.55, "notoes_collapse10pc", 3),
+    "old person": (0.9, "anny", 5),
+}
+"""What `Person` is made of."""
+
 Turns = dict[str, tuple[float, ...]]
 """Joints of a side, as the left one's, or of the middle, each turned about SMPL's x, then y, then z, in degrees."""
 
@@ -127,8 +134,7 @@ def main() -> None:
     parser.add_argument("--weights", default="human", help="a run, or weights that come along")
     options = parser.parse_args()
     transfer = PoseTransfer.from_run(weights_named(options.weights))
-    giver = Person(0.55, "notoes_collapse10pc", 3)
-    takers = Person(0.25, "notoes_collapse5pc", 4), Person(0.9, "anny", 5)
+    giver, *takers = (Person(*PEOPLE[who]) for who in ("grown-up", "child", "old person"))
     names, rows, errors = list(POSES), list[Comparison](), list[list[float]]()
     of_each = "PMD x1e-4 | mm | normal"
     print(f"| pose | rest error | child: {of_each} | old person: {of_each} |\n|---|{'---:|' * 7}")

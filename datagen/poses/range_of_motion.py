@@ -75,21 +75,25 @@ FOLDED_LEG = (  # as one squats, sits on the heels or hugs the knees: weight or 
 )
 
 _SIDES = ("left", "right")
-# limbs, the same folded tightly, their sides, and the power of a uniform number that their share is
-_TRUNK, _ARMS, _LEGS = (TRUNK, TRUNK, ("left",), 1.0), (ARM, FOLDED_ARM, _SIDES, 0.0), (LEG, FOLDED_LEG, _SIDES, 0.5)
-_FOLDED = 1 / 4  # of arms and legs: folded tightly; of trunks: bent by the whole
+_LIMBS = (  # what most are drawn from, and the power of a uniform number that their share of it is; what others are
+    (TRUNK, 1.0, TRUNK, ("left",)),
+    (ARM, 0.0, FOLDED_ARM, _SIDES),
+    (LEG, 0.5, FOLDED_LEG, _SIDES),
+)
+_OTHERS = 1 / 4  # of each kind: drawn from the whole of their range, arms and legs folded tightly
 _ALIKE = 1 / 3  # of poses: both arms do the same, and likewise both legs
 
 
 class AnatomicalSource:
     """See :class:`datagen.poses.PoseSource`: each limb by a share of its range, over SMPL's joints.
 
-    The share is uniform in [0, 1] for the trunk, the root of a uniform number for a leg, and the whole for an arm, as
-    arms hang, reach and fold. A quarter of the trunks bend by the whole, and of the arms and legs are folded tightly,
-    by the whole of narrower ranges. In a third of the poses both arms do the same, and independently in a third both
-    legs.
-    Else joints are independent, so there are poses that nobody takes, and limbs may go through the body. The recipe's
-    ``npt`` is the share of poses, by chance, that are of NPT's generator instead.
+    Of a quarter of the trunks, with neck and head, the share is the whole; of the others a uniform number in [0, 1]. A
+    quarter of the arms and a quarter of the legs, each by itself, are folded tightly: drawn from the whole of narrower
+    ranges. Of the others the share is the whole for an arm, as arms hang, reach and fold, and the root of a uniform
+    number for a leg. In a third of the poses both arms do the same, and independently in a third both legs.
+
+    There are poses that nobody takes, and limbs may go through the body. The recipe's ``npt`` is the share of poses, by
+    chance, that are of NPT's generator instead.
     """
 
     joints, parents = JOINTS, PARENTS
@@ -105,13 +109,12 @@ class AnatomicalSource:
         if random.uniform() < self._npt:
             return npt_pose(("bent", "straight")[pose % 2], random)
         rotations = np.zeros((len(JOINTS), 3))
-        for limb, folded, sides, power in (_TRUNK, _ARMS, _LEGS):
+        for limb, power, other, sides in _LIMBS:
             alike, turned = random.uniform() < _ALIKE, list[NDArray[np.float64]]()
             for side in sides:
                 if not turned or not alike:
-                    fold = random.uniform() < _FOLDED
-                    share = 1.0 if fold else random.uniform() ** power
-                    turned = [motion.draw(random, share) for motion in (folded if fold else limb)]
+                    motions, share = (other, 1.0) if random.uniform() < _OTHERS else (limb, random.uniform() ** power)
+                    turned = [motion.draw(random, share) for motion in motions]
                 for motion, turn in zip(limb, turned, strict=True):
                     for joint in motion.joints:
                         rotations[JOINTS.index(joint.replace("left", side))] = turn * _MIRROR[side]

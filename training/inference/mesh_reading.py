@@ -27,7 +27,7 @@ from training.recipes.networks import PEOPLE
 
 _ROUGH, _SLIGHT = 0.88, 0.004
 """Roughness above which a mesh is filtered, and by how much vertices must differ from their neighbours, half the box'
-longest edge being 1: rounded coordinates do not matter (docs/results/parts.md).
+longest edge being 1: rounded coordinates do not matter (docs/results/parts-experiments.md).
 """
 _WEAK = 2
 """How often animals and coarse meshes are filtered, of which more takes too much."""

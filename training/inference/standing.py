@@ -8,6 +8,7 @@ turns between the axes as well, so that it is done without being asked for.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
@@ -47,7 +48,7 @@ dressed, and animals that were read rightly by weights of their kind have less, 
 (docs/results/transfer.md)."""
 SURELY_READ = 3.5
 """Degrees of rest error up to which an upright mesh that faces ahead is read rightly: turned by a quarter or a half,
-and read so all the same, people have more by `human`, animals by `animals` (docs/results/parts.md)."""
+and read so all the same, people have more by `human`, animals by `animals` (docs/results/parts-experiments.md)."""
 KNOWN = 0.002
 """Misfit up to which a mesh is well understood as it stands, as most bare people in NPT's poses are
 (docs/results/transfer.md)."""
@@ -172,15 +173,16 @@ def stands(network: Parts, mesh: Mesh) -> Standing:
     """Find how a mesh stands (`standing`), told its surface where vertices alone leave a doubt.
 
     Where parts touch, as a hand does a hip, vertices alone are misunderstood, and facing is read off them less well. So
-    one that is not well understood as it is, or faces aside, is read with its surface; where it stands upright, faces
-    ahead and has a rest error of at most `SURELY_READ` then, it stays so, unasked for other ways. Of a mesh for which
-    another way was found, the facing is corrected; but one that is read to face straight ahead as it is, with a rest
-    error of at most 1.25 times the other way's, stays so. One that is misread even then, and was not found to lean, is
-    turned by quarters about all axes, where that makes the rest error clearly less.
+    one that is not well understood as it is, or not clearly better than from behind, or faces aside, is read with its
+    surface; where it stands upright, faces ahead and has a rest error of at most `SURELY_READ` then, it stays so,
+    unasked for other ways. Of a mesh for which another way was found, the facing is corrected; but one that is read to
+    face straight ahead as it is, with a rest error of at most 1.25 times the other way's, stays so. One that is misread
+    even then, and was not found to lean, is turned by quarters about all axes, where that makes the rest error clearly
+    less.
     """
     body = _Body(network, mesh)
     seen = body.ways.as_it_is()
-    in_doubt = seen.misfit > KNOWN or seen.is_aside
+    in_doubt = seen.misfit > KNOWN or seen.is_aside or body.ways.behind.misfit < _CLEARLY * seen.misfit
     stays = body.read(seen.way, seen.misfit) if in_doubt else seen.stands
     assert stays.root is not None
     if stays.rest_error <= SURELY_READ and _is_straight(stays.root) and _leaning(stays.root) <= _UPRIGHT:
@@ -331,6 +333,11 @@ class _Ways:
     def as_it_is(self) -> _Seen:
         return self.seen([np.eye(3)])[0]
 
+    @cached_property
+    def behind(self) -> _Seen:
+        """From behind."""
+        return self.seen([_about_vertical(np.pi)])[0]
+
     def by_more(self) -> "_Ways | None":
         """The same by more vertices, where the mesh has any."""
         return _Ways(self._understand, self._points, _MORE_VERTICES) if len(self._points) > self._vertices else None
@@ -345,8 +352,8 @@ class _Ways:
 
         Of aside a few vertices tell where it is plain; from behind a body that raises its hands looks much the same.
         """
-        behind, aside = _about_vertical(np.pi), [_about_vertical(angle) for angle in (-np.pi / 2, np.pi / 2)]
-        others = self.seen([behind])
+        aside = [_about_vertical(angle) for angle in (-np.pi / 2, np.pi / 2)]
+        others = [self.behind]
         if not all(_SURELY * seen.misfit <= other.misfit for other in self.seen(aside, _FIRST_VERTICES)):
             others += self.seen(aside)
         return all(seen.misfit <= _CLEARLY * other.misfit for other in others)

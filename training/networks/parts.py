@@ -6,7 +6,7 @@ target's parts are turned as the source's are, its skeleton takes its joints alo
 blend skinning. That is learned from what the papers' networks are not told: weights, joints and rotations of bodies
 that have a rig (:mod:`training.objectives.parts`). Where faces are known, vertices hear only of what is near along the
 surface (:mod:`training.networks.layers.surface`), so that a hand on a thigh is not taken for the thigh's; and they
-follow no part that is not near so, nor one of which no neighbour in the skeleton lies near what is near.
+follow no part that is not near so, nor one that does not hang there on the root.
 
     read(source), read(target) -> turns D_k = R_k(source) R_k(target)^T -> joints -> vertices, in their own box
 
@@ -29,11 +29,11 @@ from training.networks.layers.rigid_parts import (
     ancestors,
     box,
     halved,
+    holders,
     matrices,
     mirrored,
     moved_joints,
     nearest_rotations,
-    neighbours,
     other_side,
     rotations_from_six,
     skinned,
@@ -45,8 +45,10 @@ from training.recipes.networks import PEOPLE
 _VARIANCE_FLOOR = 1e-5
 _LEAST_NEAR, _LEAST_HOLDING = 0.07, 0.25
 """Share of a part's surface that has to lie near a vertex, along the surface, for the vertex to follow the part; and
-how much of one that it hangs on, or that hangs on it, near what is near, of the most that lies near any place
-(docs/results/parts.md)."""
+how much of one has to lie near a place, of the most that lies near any, for others to hang on it there
+(docs/results/parts-experiments.md)."""
+_STEPS = 8
+"""From place to place and part to part, that reach all of a body from its root: people take five, animals six."""
 
 
 class Reading(NamedTuple):
@@ -134,7 +136,7 @@ class Parts(nn.Module):
     takes_surfaces = True
     parents: Tensor
     above: Tensor
-    next_to: Tensor
+    holders: Tensor
     other_side: Tensor | None
     upright: Tensor
 
@@ -151,7 +153,7 @@ class Parts(nn.Module):
         own = [part if parent < 0 else parent for part, parent in enumerate(parents)]
         self.register_buffer("parents", torch.tensor(own), persistent=False)
         self.register_buffer("above", ancestors(parents), persistent=False)
-        self.register_buffer("next_to", neighbours(own), persistent=False)
+        self.register_buffer("holders", holders(own), persistent=False)
         self.register_buffer("other_side", other_side(self.joints), persistent=False)
         self.register_buffer("upright", torch.tensor([1.0, 0, 0, 0, 1, 0]), persistent=False)
         self.lift = nn.Linear(6, 64)
@@ -221,7 +223,7 @@ class Parts(nn.Module):
             found = self.read_again(drawn, of_all._replace(logits=taken(of_all.logits, drawn.rows)))
             is_its_sample = drawn.rows.shape == of_all.logits.shape[:2]
             logits = taken(found.logits, drawn.rows.argsort(dim=1)) if is_its_sample else of_all.logits
-            return ReadTarget(target, read, drawn, _weights(logits, drawn, self.next_to), found.rotations, found.joints)
+            return ReadTarget(target, read, drawn, _weights(logits, drawn, self.holders), found.rotations, found.joints)
 
     def posed_target(
         self,
@@ -284,7 +286,7 @@ class Parts(nn.Module):
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
         if drawn.surface is not None:
             sampled = drawn.surface.at(drawn.rows)
-            near = _near_parts(reading.logits, sampled, drawn.masses, self.next_to)
+            near = _near_parts(reading.logits, sampled, drawn.masses, self.holders)
             reading = reading._replace(logits=_of_near(reading.logits, near, sampled))
         rest = self.posed_to_rest(drawn.vertices, reading)
         found = self.read(drawn.moved(rest.vertices))
@@ -337,7 +339,7 @@ class Parts(nn.Module):
         """Return weights [b, n, part] of vertices [b, n, 3] of meshes with such a sample, as they are first read."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn, self.next_to)
+        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn, self.holders)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -496,35 +498,37 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
 
 
-def _weights(logits: Tensor, drawn: Sample, next_to: Tensor) -> Tensor:
-    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near, or held by
-    no other.
+def _weights(logits: Tensor, drawn: Sample, holders: Tensor) -> Tensor:
+    """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near, or hangs on
+    nothing there.
     """
     if drawn.surface is None:
         return logits.softmax(2)
-    near = _near_parts(taken(logits, drawn.rows), drawn.surface.at(drawn.rows), drawn.masses, next_to)
+    near = _near_parts(taken(logits, drawn.rows), drawn.surface.at(drawn.rows), drawn.masses, holders)
     return _of_near(logits, near, drawn.surface).softmax(2)
 
 
-def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, next_to: Tensor) -> Tensor:
+def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, holders: Tensor) -> Tensor:
     """Which parts the vertices of each cell [b, cell, part] may follow, by a sample's logits [b, k, part]; none: all.
 
-    A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left foot that
-    lies at the right knee and is taken for the right one, but hangs on no right shank. How much of a part is near along
-    the surface is told by the masses of the sample [b, k], however finely the mesh is meshed there. It is asked twice:
-    a shank that was taken for the wrong one holds no foot any more. Where a mesh is of several pieces, each of which is
-    near to all of the others, they hold whatever there is. A root holds itself, too.
+    A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left hand that
+    lies in the right one and is taken for it, wrist and all, but at an elbow that is the left one's. So a part is
+    followed where it hangs on the root: the root itself does, and near where a part does, along the surface, more of it
+    does, and what hangs on it in the skeleton. How much of a part is near is told by the masses of the sample [b, k],
+    however finely the mesh is meshed there. Where a mesh is of several pieces, each of which is near to all of the
+    others, whatever there is hangs on the root.
     """
-    beside = surface.near.to(logits.dtype)
-    near = torch.ones_like(beside[..., :1], dtype=torch.bool).expand(-1, -1, logits.shape[2])
-    for _ in range(2):
-        shares = _of_near(logits, near, surface).softmax(2) * masses[..., None]
-        in_cell = shares.new_zeros(near.shape).scatter_add(1, surface.cells[..., None].expand_as(shares), shares)
-        share = beside @ in_cell / in_cell.sum(1, keepdim=True).clamp_min(1e-12)
-        holds = share >= _LEAST_HOLDING * share.amax(1, keepdim=True)
-        near = (share >= _LEAST_NEAR) & (beside @ (holds.to(share.dtype) @ next_to) > 0)
-        near = near | ~near.any(2, keepdim=True)
-    return near
+    shares = logits.softmax(2) * masses[..., None]
+    beside = surface.near.to(shares.dtype)
+    cells = surface.cells[..., None].expand_as(shares)
+    in_cell = shares.new_zeros(*beside.shape[:2], shares.shape[2]).scatter_add(1, cells, shares)
+    share = beside @ in_cell / in_cell.sum(1, keepdim=True).clamp_min(1e-12)
+    is_there = (share >= _LEAST_HOLDING * share.amax(1, keepdim=True)).to(share.dtype)
+    hanging = is_there * (holders.sum(0) == 1)  # the roots
+    for _ in range(_STEPS):
+        hanging = is_there * (beside @ hanging @ holders > 0)
+    near = (share >= _LEAST_NEAR) & (beside @ hanging @ holders > 0)
+    return near | ~near.any(2, keepdim=True)
 
 
 def _of_near(logits: Tensor, near: Tensor, surface: Surface) -> Tensor:

@@ -59,9 +59,9 @@ FAMILIES = {
 POSES = {
     "npt": "drawn per joint from uniform ranges, as Neural Pose Transfer's generator draws them: joints are "
     "independent, so there are poses that nobody takes, and limbs may go through the body",
-    "anatomical": "drawn per joint from people's ranges of motion: joints are independent, but for arms and "
-    "legs folded together and limbs that do alike, so there are poses that nobody takes, and limbs may go through the "
-    "body",
+    "anatomical": "drawn limb by limb from people's ranges of motion, of arms and legs a quarter folded tightly; in a "
+    "third both arms do the same, in a third both legs. Else limbs are independent, so there are poses that nobody "
+    "takes, and limbs may go through the body",
     "ranges": "drawn per joint from uniform ranges of the recipe's own: joints are independent, so there may be poses "
     "that nobody takes",
     "clips": "moments of the animation clips of rigged characters",

@@ -361,24 +361,31 @@ def test_another_way_is_not_taken_where_the_surface_is_read_as_well_as_it_is(
 
 
 @pytest.mark.parametrize(
-    ("misfit", "aside", "surely", "surface", "asked"),
+    ("misfit", "behind", "aside", "surely", "surface", "asked"),
     [
-        (0.001, 8, True, [0, 0], True),  # no doubt, so that its surface is not read
-        (0.001, 12, True, [0, 0], False),
-        (0.003, 0, True, [0, 0], False),
-        (0.001, 12, False, [0, 0], True),
-        (0.001, 12, True, [12, 0], True),
-        (0.001, 12, True, [0, 15], True),
+        (0.001, 0.0016, 8, True, [0, 0], True),  # no doubt, so that its surface is not read
+        (0.001, 0.0014, 8, True, [0, 0], False),
+        (0.001, 0.0016, 12, True, [0, 0], False),
+        (0.003, 0.0060, 0, True, [0, 0], False),
+        (0.001, 0.0016, 12, False, [0, 0], True),
+        (0.001, 0.0016, 12, True, [12, 0], True),
+        (0.001, 0.0016, 12, True, [0, 15], True),
     ],
 )
 def test_a_body_in_doubt_whose_surface_is_surely_read_upright_and_ahead_is_asked_for_no_other_way(
-    monkeypatch: pytest.MonkeyPatch, misfit: float, aside: float, surely: bool, surface: list[float], asked: bool
+    monkeypatch: pytest.MonkeyPatch,
+    misfit: float,
+    behind: float,
+    aside: float,
+    surely: bool,
+    surface: list[float],
+    asked: bool,
 ) -> None:
-    root, read = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None], list[int]()
+    root, read = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None], list[bool]()
 
     def understood(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        read.append(len(meshes))
-        return np.full(len(meshes), misfit), root
+        read.append(len(meshes))  # from behind after as it is
+        return np.array([misfit if len(read) == 1 else behind]), root
 
     of_surface = Rotation.from_euler("YX", surface, degrees=True).as_matrix()
     others = list[object]()
@@ -387,5 +394,7 @@ def test_a_body_in_doubt_whose_surface_is_surely_read_upright_and_ahead_is_asked
     monkeypatch.setattr(module, "_found", lambda _, seen: others.append(seen.root) or seen.stands)
     found = module.stands(lively("parts"), Mesh(BODY, np.empty((0, 3), np.int64)))
     assert np.array_equal(found.matrix, np.eye(3)) and bool(others) == asked
-    assert np.isnan(found.rest_error) == (aside == 8)
-    assert read == [1] and all(np.array_equal(each, root[0]) for each in others), "what was seen is handed on"
+    assert np.isnan(found.rest_error) == (aside == 8 and behind > 1.5 * misfit)
+    assert read == ([1, 1] if aside == 8 else [1]) and all(np.array_equal(each, root[0]) for each in others), (
+        "what was seen is handed on"
+    )

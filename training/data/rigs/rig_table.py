@@ -253,7 +253,7 @@ def _surfaces(dataset: Dataset, identity: int, count: int) -> Iterator[Surface]:
     """The surfaces of an identity in so many of its poses.
 
     Which vertices share a cell differs from pose to pose: told those of one pose alone, a network learns the cells by
-    heart, and reads bodies less well that are told their own (docs/results/parts.md).
+    heart, and reads bodies less well that are told their own (docs/results/parts-experiments.md).
     """
     poses, edges = dataset.grid.poses_of(identity), edges_of(dataset.faces(identity))
     for vertices in dataset.vertices(identity, [poses[place * len(poses) // count] for place in range(count)]):

@@ -105,10 +105,16 @@ def ancestors(parents: Sequence[int]) -> Tensor:
     return above
 
 
-def neighbours(parents: Sequence[int]) -> Tensor:
-    """Return [part, part] float32: more than 0 where one hangs on the other; a root's parent is itself."""
-    on = torch.eye(len(parents))[list(parents)]
-    return on + on.T
+def holders(parents: Sequence[int]) -> Tensor:
+    """Return [part, part] float32: 1 where the second is the first, or hangs on it, or on one that does; a root's
+    parent is itself.
+    """
+    own = torch.arange(len(parents))
+    on = torch.tensor(parents)
+    found = torch.zeros(len(parents), len(parents))
+    for above in (own, on, on[on]):
+        found[above, own] = 1
+    return found
 
 
 def moved_joints(joints: Tensor, rotations: Tensor, parents: Tensor, above: Tensor) -> Tensor:

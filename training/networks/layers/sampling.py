@@ -26,7 +26,7 @@ _BEYOND = 5
 """Coordinates are cut off there, in the same unit, so that no two cells have one number."""
 MOST_SAMPLED = 2048
 """Vertices of a mesh that are sampled at most. By half as many dense meshes have an eighth to a quarter more error
-(docs/results/parts.md)."""
+(docs/results/parts-experiments.md)."""
 _AT_ONCE, _REGION = 512, 0.25
 """So many vertices that are not of the sample are told at a time, region after region; the edge of a region, half the
 longest edge of a mesh' box being 1."""
@@ -158,9 +158,9 @@ def taken(vertices: Tensor, index: Tensor) -> Tensor:
 def _thinned(vertices: Tensor, surface: Surface | None) -> tuple[Tensor, Tensor]:
     """Numbers [b, k] of vertices, and which of them [b, k] are the nearest to the middle of their cells.
 
-    Of more cells than the sample takes (`MOST_SAMPLED`), those are taken whose vertex is nearest to
-    the middle: on a body they lie more evenly than a draw (docs/results/parts.md), but flat faces along the grid may be
-    left out as a whole. Layers of a surface that touch have cells of their own.
+    Of more cells than the sample takes (`MOST_SAMPLED`), those are taken whose vertex is nearest to the middle: on a
+    body they lie more evenly than a draw (docs/results/parts-experiments.md), but flat faces along the grid may be left
+    out as a whole. Layers of a surface that touch have cells of their own.
     """
     scaled = vertices.nan_to_num().clamp(-_BEYOND, _BEYOND) / _CELL
     cell = scaled.floor()

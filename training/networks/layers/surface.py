@@ -32,7 +32,8 @@ _FAR = 0.35
 bodies that are not folded up."""
 _LONGEST, _MOST_FOLDED = 2.8, 2.0
 """The longest way along the surface of an ordinary body, in half the longest edge of its box: people and animals have
-2.1 to 3.2. What has more is measured as if its box were larger, up to so many times (docs/results/parts.md)."""
+2.1 to 3.2. What has more is measured as if its box were larger, up to so many times
+(docs/results/parts-experiments.md)."""
 
 
 _ELSEWHERE = (1.0, np.sqrt(2), np.sqrt(3))

@@ -12,7 +12,7 @@ from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks import parts
 from training.networks.layers import sampling
-from training.networks.layers.rigid_parts import neighbours
+from training.networks.layers.rigid_parts import holders
 from training.networks.layers.sampling import Sample, sample
 from training.networks.layers.surface import Surface, _Cells, joined, of_cells, surface_of
 from training.networks.parts import Parts
@@ -250,8 +250,8 @@ def test_crumbs_are_one_cell_that_is_near_to_all() -> None:
     assert (found == near(mesh)).all()
 
 
-ALL = torch.ones(3, 3)
-"""Three parts of which each hangs on each."""
+ALL = torch.eye(3)
+"""Three parts, each a root."""
 
 
 def two_parts(mesh: Mesh, few: slice) -> torch.Tensor:
@@ -295,7 +295,8 @@ def legs(mesh: Mesh) -> torch.Tensor:
     ("shank", "foot"),
     [
         pytest.param(0.0, 0.5, id="a foot"),
-        pytest.param(0.26, 0.125, id="too little of a foot to hold the third of a shank that it hangs on"),
+        pytest.param(0.26, 0.125, id="a third of a shank with a quarter of a foot"),
+        pytest.param(0.26, 0.5, id="a third of a shank with its foot"),
     ],
 )
 def test_what_lies_at_the_other_leg_and_hangs_on_none_of_its_parts_is_not_of_that_leg(
@@ -303,16 +304,16 @@ def test_what_lies_at_the_other_leg_and_hangs_on_none_of_its_parts_is_not_of_tha
 ) -> None:
     """The left leg's vertices from a foot's way below the ankle to a shank's way above it are taken for the right's."""
     mesh = hairpin()
-    true, next_to = legs(mesh), neighbours([0, 0, 1, 2, 0, 4, 5])
+    true, hang_on = legs(mesh), holders([0, 0, 1, 2, 0, 4, 5])
     x = torch.from_numpy(mesh.vertices[:, 0])
     wrong = (true > 0) & (true < 4) & (x > -0.5 - foot - 0.01) & (x < -0.5 + shank)
     assert wrong.sum() > 20
     logits = 2 * torch.eye(7)[true] + 4 * torch.eye(7)[torch.where(wrong, true + 3, true)]
     drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
-    weights = parts._weights(logits[None], drawn, next_to)[0]
+    weights = parts._weights(logits[None], drawn, hang_on)[0]
     assert torch.equal(weights.argmax(1), true) and weights[wrong].gather(1, true[wrong, None] + 3).eq(0).all()
     monkeypatch.setattr(parts, "_LEAST_HOLDING", 0.0)
-    by_what_is_near = parts._weights(logits[None], drawn, next_to)[0]
+    by_what_is_near = parts._weights(logits[None], drawn, hang_on)[0]
     assert by_what_is_near[wrong].argmax(1).ge(4).all(), "else this shows nothing"
 
 
@@ -332,9 +333,9 @@ def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -
     torch.testing.assert_close(parts._weights(logits[None], drawn, ALL)[0], logits.softmax(1), rtol=0, atol=1e-4)
 
 
-def test_either_of_two_parts_that_hang_together_holds_the_other_and_a_root_itself() -> None:
-    expected = [[True, True, False], [True, False, True], [False, True, False]]
-    assert neighbours([0, 0, 1]).gt(0).tolist() == expected
+def test_a_part_hangs_on_itself_on_its_parent_and_on_that_ones() -> None:
+    expected = [[1, 1, 1, 0], [0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]]
+    assert holders([0, 0, 1, 2]).tolist() == expected
 
 
 def test_a_part_too_large_to_lie_near_anything_holds_what_hangs_on_it() -> None:
@@ -343,7 +344,7 @@ def test_a_part_too_large_to_lie_near_anything_holds_what_hangs_on_it() -> None:
     head = vertices[0, :, 0].lt(-0.7) & torch.arange(len(mesh.vertices)).lt(len(mesh.vertices) // 2)
     logits = 4 * torch.eye(2)[head.long()]
     drawn = sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
-    weights = parts._weights(logits[None], drawn, neighbours([0, 0]))[0]
+    weights = parts._weights(logits[None], drawn, holders([0, 0]))[0]
     assert torch.equal(weights.argmax(1), head.long())
     assert weights[head, 0].gt(0).any(), "the trunk holds itself at the neck"
 
@@ -373,8 +374,8 @@ def test_targets_and_projections_are_posed_by_parts_that_are_near(monkeypatch: p
     drawn = sample(vertices, surface)
     asked = list[Sample]()
 
-    def weights_of(logits: torch.Tensor, drawn: Sample, next_to: torch.Tensor) -> torch.Tensor:
-        assert next_to is network.next_to
+    def weights_of(logits: torch.Tensor, drawn: Sample, holders: torch.Tensor) -> torch.Tensor:
+        assert holders is network.holders
         asked.append(drawn)
         return torch.zeros_like(logits)
 
