@@ -160,14 +160,16 @@ def report_transfers(transfer: PoseTransfer, bodies: list[Pair]) -> None:
 def report_everyday(network: Parts) -> None:
     """People in everyday poses, as they are, from behind and lying, who are read more than 20 degrees off."""
     ways = {"as it is": ("y", 0), "from behind": ("y", 180), "on the back": ("x", -90), "on the side": ("z", 90)}
-    print(f"of {len(POSES) * len(PEOPLE) * len(ways)} people in everyday poses more than 20 degrees off:")
+    far, count = 0, len(POSES) * len(PEOPLE) * len(ways)
     for who, person in PEOPLE.items():
         body = Person(*person)
         for pose in POSES:
             for way, turn in ways.items():
                 off = degrees_off(network, body(pose), Rotation.from_euler(*turn, degrees=True))[1]
                 if off > 20:
-                    print(f"  {who}, {pose}, {way}: {off:.0f} degrees", flush=True)
+                    far += 1
+                    print(f"{who}, {pose}, {way}: {off:.0f} degrees", flush=True)
+    print(f"{far} of {count} in everyday poses are read more than 20 degrees off")
 
 
 def boxed(vertices: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -75,7 +75,7 @@ FOLDED_LEG = (  # as one squats, sits on the heels or hugs the knees: weight or 
 )
 
 _SIDES = ("left", "right")
-_LIMBS = (  # what most are drawn from, and the power of a uniform number that their share of it is; what others are
+_LIMBS = (  # what most are drawn from; the power of a uniform number that their share is; what others are; sides
     (TRUNK, 1.0, TRUNK, ("left",)),
     (ARM, 0.0, FOLDED_ARM, _SIDES),
     (LEG, 0.5, FOLDED_LEG, _SIDES),

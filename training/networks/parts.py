@@ -29,7 +29,7 @@ from training.networks.layers.rigid_parts import (
     ancestors,
     box,
     halved,
-    holders,
+    hanging_on,
     matrices,
     mirrored,
     moved_joints,
@@ -48,7 +48,7 @@ _LEAST_NEAR, _LEAST_HOLDING = 0.07, 0.25
 how much of one has to lie near a place, of the most that lies near any, for others to hang on it there
 (docs/results/parts-experiments.md)."""
 _STEPS = 8
-"""From place to place and part to part, that reach all of a body from its root: people take five, animals six."""
+"""At least so many, from place to place and part to part, are gone from the root over the body."""
 
 
 class Reading(NamedTuple):
@@ -136,7 +136,7 @@ class Parts(nn.Module):
     takes_surfaces = True
     parents: Tensor
     above: Tensor
-    holders: Tensor
+    hangs_on: Tensor
     other_side: Tensor | None
     upright: Tensor
 
@@ -153,7 +153,8 @@ class Parts(nn.Module):
         own = [part if parent < 0 else parent for part, parent in enumerate(parents)]
         self.register_buffer("parents", torch.tensor(own), persistent=False)
         self.register_buffer("above", ancestors(parents), persistent=False)
-        self.register_buffer("holders", holders(own), persistent=False)
+        self._steps = max(_STEPS, int(self.above.sum(1).max()) - 1)  # the depth of the tree
+        self.register_buffer("hangs_on", hanging_on(own), persistent=False)
         self.register_buffer("other_side", other_side(self.joints), persistent=False)
         self.register_buffer("upright", torch.tensor([1.0, 0, 0, 0, 1, 0]), persistent=False)
         self.lift = nn.Linear(6, 64)
@@ -223,7 +224,9 @@ class Parts(nn.Module):
             found = self.read_again(drawn, of_all._replace(logits=taken(of_all.logits, drawn.rows)))
             is_its_sample = drawn.rows.shape == of_all.logits.shape[:2]
             logits = taken(found.logits, drawn.rows.argsort(dim=1)) if is_its_sample else of_all.logits
-            return ReadTarget(target, read, drawn, _weights(logits, drawn, self.holders), found.rotations, found.joints)
+            return ReadTarget(
+                target, read, drawn, _weights(logits, drawn, self.hangs_on, self._steps), found.rotations, found.joints
+            )
 
     def posed_target(
         self,
@@ -286,7 +289,7 @@ class Parts(nn.Module):
         """What is read of a sample that a reading posed to rest, and how far off [b, part, 3] its joints are there."""
         if drawn.surface is not None:
             sampled = drawn.surface.at(drawn.rows)
-            near = _near_parts(reading.logits, sampled, drawn.masses, self.holders)
+            near = _near_parts(reading.logits, sampled, drawn.masses, self.hangs_on, self._steps)
             reading = reading._replace(logits=_of_near(reading.logits, near, sampled))
         rest = self.posed_to_rest(drawn.vertices, reading)
         found = self.read(drawn.moved(rest.vertices))
@@ -339,7 +342,7 @@ class Parts(nn.Module):
         """Return weights [b, n, part] of vertices [b, n, 3] of meshes with such a sample, as they are first read."""
         known = _OfSample()
         features = self._passed(drawn.around, drawn, known)
-        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn, self.holders)
+        return _weights(self.part(self._of_all(vertices, drawn, features, known)), drawn, self.hangs_on, self._steps)
 
     def read_pair(
         self, source: Tensor, target: Tensor, surfaces: tuple[Surface, Surface] | None = None
@@ -498,36 +501,39 @@ def _statistics(outputs: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.rsqrt(variance + _VARIANCE_FLOOR)
 
 
-def _weights(logits: Tensor, drawn: Sample, holders: Tensor) -> Tensor:
+def _weights(logits: Tensor, drawn: Sample, hangs_on: Tensor, steps: int = _STEPS) -> Tensor:
     """Skinning weights [b, n, part] of all vertices of a sample's meshes, none of a part that is not near, or hangs on
     nothing there.
     """
     if drawn.surface is None:
         return logits.softmax(2)
-    near = _near_parts(taken(logits, drawn.rows), drawn.surface.at(drawn.rows), drawn.masses, holders)
+    near = _near_parts(taken(logits, drawn.rows), drawn.surface.at(drawn.rows), drawn.masses, hangs_on, steps)
     return _of_near(logits, near, drawn.surface).softmax(2)
 
 
-def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, holders: Tensor) -> Tensor:
-    """Which parts the vertices of each cell [b, cell, part] may follow, by a sample's logits [b, k, part]; none: all.
+def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, hangs_on: Tensor, steps: int) -> Tensor:
+    """Which parts the vertices of each cell [b, cell, part] may follow, by a sample's logits [b, k, part].
 
     A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left hand that
     lies in the right one and is taken for it, wrist and all, but at an elbow that is the left one's. So a part is
     followed where it hangs on the root: the root itself does, and near where a part does, along the surface, more of it
     does, and what hangs on it in the skeleton. How much of a part is near is told by the masses of the sample [b, k],
-    however finely the mesh is meshed there. Where a mesh is of several pieces, each of which is near to all of the
-    others, whatever there is hangs on the root.
+    however finely the mesh is meshed there. Where nothing that is near hangs so, all that is near may be followed, and
+    where nothing is near, all. Where a mesh is of several pieces, each of which is near to all of the others, whatever
+    there is hangs on the root.
     """
     shares = logits.softmax(2) * masses[..., None]
     beside = surface.near.to(shares.dtype)
     cells = surface.cells[..., None].expand_as(shares)
     in_cell = shares.new_zeros(*beside.shape[:2], shares.shape[2]).scatter_add(1, cells, shares)
     share = beside @ in_cell / in_cell.sum(1, keepdim=True).clamp_min(1e-12)
-    is_there = (share >= _LEAST_HOLDING * share.amax(1, keepdim=True)).to(share.dtype)
-    hanging = is_there * (holders.sum(0) == 1)  # the roots
-    for _ in range(_STEPS):
-        hanging = is_there * (beside @ hanging @ holders > 0)
-    near = (share >= _LEAST_NEAR) & (beside @ hanging @ holders > 0)
+    is_there = ((share >= _LEAST_HOLDING * share.amax(1, keepdim=True)) & (share > 0)).to(share.dtype)
+    hanging = is_there * (hangs_on.sum(0) == 1)  # the roots
+    for _ in range(steps):
+        hanging = is_there * (beside @ hanging @ hangs_on > 0)
+    near = share >= _LEAST_NEAR
+    held = near & (beside @ hanging @ hangs_on > 0)
+    near = torch.where(held.any(2, keepdim=True), held, near)
     return near | ~near.any(2, keepdim=True)
 
 

@@ -381,7 +381,7 @@ def test_a_body_in_doubt_whose_surface_is_surely_read_upright_and_ahead_is_asked
     surface: list[float],
     asked: bool,
 ) -> None:
-    root, read = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None], list[bool]()
+    root, read = Rotation.from_euler("y", aside, degrees=True).as_matrix()[None], list[int]()
 
     def understood(meshes: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         read.append(len(meshes))  # from behind after as it is

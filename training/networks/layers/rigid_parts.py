@@ -105,16 +105,10 @@ def ancestors(parents: Sequence[int]) -> Tensor:
     return above
 
 
-def holders(parents: Sequence[int]) -> Tensor:
-    """Return [part, part] float32: 1 where the second is the first, or hangs on it, or on one that does; a root's
-    parent is itself.
-    """
-    own = torch.arange(len(parents))
-    on = torch.tensor(parents)
-    found = torch.zeros(len(parents), len(parents))
-    for above in (own, on, on[on]):
-        found[above, own] = 1
-    return found
+def hanging_on(parents: Sequence[int]) -> Tensor:
+    """Return [part, part] float32: 1 where the second is the first, or hangs on it; a root's parent is itself."""
+    own = torch.eye(len(parents))
+    return own.maximum(own[list(parents)].mT)
 
 
 def moved_joints(joints: Tensor, rotations: Tensor, parents: Tensor, above: Tensor) -> Tensor:

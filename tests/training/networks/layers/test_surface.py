@@ -12,7 +12,7 @@ from tests.support.three_networks import lively
 from training.inference.mesh_reading import surfaces_of
 from training.networks import parts
 from training.networks.layers import sampling
-from training.networks.layers.rigid_parts import holders
+from training.networks.layers.rigid_parts import hanging_on
 from training.networks.layers.sampling import Sample, sample
 from training.networks.layers.surface import Surface, _Cells, joined, of_cells, surface_of
 from training.networks.parts import Parts
@@ -291,30 +291,45 @@ def legs(mesh: Mesh) -> torch.Tensor:
     return torch.where((part > 0) & (torch.arange(len(part)) >= len(part) // 2), part + 3, part)
 
 
+@pytest.mark.parametrize("sure", [4.0, 20.0])
 @pytest.mark.parametrize(
     ("shank", "foot"),
     [
         pytest.param(0.0, 0.5, id="a foot"),
         pytest.param(0.26, 0.125, id="a third of a shank with a quarter of a foot"),
-        pytest.param(0.26, 0.5, id="a third of a shank with its foot"),
+        pytest.param(0.6, 0.5, id="a whole shank with its foot"),
     ],
 )
 def test_what_lies_at_the_other_leg_and_hangs_on_none_of_its_parts_is_not_of_that_leg(
-    shank: float, foot: float, monkeypatch: pytest.MonkeyPatch
+    shank: float, foot: float, sure: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The left leg's vertices from a foot's way below the ankle to a shank's way above it are taken for the right's."""
     mesh = hairpin()
-    true, hang_on = legs(mesh), holders([0, 0, 1, 2, 0, 4, 5])
+    true, hangs_on = legs(mesh), hanging_on([0, 0, 1, 2, 0, 4, 5])
     x = torch.from_numpy(mesh.vertices[:, 0])
     wrong = (true > 0) & (true < 4) & (x > -0.5 - foot - 0.01) & (x < -0.5 + shank)
     assert wrong.sum() > 20
-    logits = 2 * torch.eye(7)[true] + 4 * torch.eye(7)[torch.where(wrong, true + 3, true)]
+    logits = 2 * torch.eye(7)[true] + sure * torch.eye(7)[torch.where(wrong, true + 3, true)]
     drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
-    weights = parts._weights(logits[None], drawn, hang_on)[0]
+    weights = parts._weights(logits[None], drawn, hangs_on)[0]
     assert torch.equal(weights.argmax(1), true) and weights[wrong].gather(1, true[wrong, None] + 3).eq(0).all()
     monkeypatch.setattr(parts, "_LEAST_HOLDING", 0.0)
-    by_what_is_near = parts._weights(logits[None], drawn, hang_on)[0]
+    by_what_is_near = parts._weights(logits[None], drawn, hangs_on)[0]
     assert by_what_is_near[wrong].argmax(1).ge(4).all(), "else this shows nothing"
+
+
+def test_all_of_a_long_chain_of_parts_hangs_on_its_root() -> None:
+    """Twenty-four along the hairpin, from the free end of one strip to that of the other."""
+    mesh, count = hairpin(), 24
+    x, first = mesh.vertices[:, 0], np.arange(len(mesh.vertices)) < len(mesh.vertices) // 2
+    way = np.where(first, 1 + x, 3 - x) / 4
+    part = torch.from_numpy(np.clip((way * count).astype(int), 0, count - 1))
+    logits, chain = 4 * torch.eye(count)[part], hanging_on([0, *range(count - 1)])
+    drawn = sample(torch.from_numpy(mesh.vertices).float()[None], surface_of(mesh.vertices, edges_of(mesh.faces)))
+    network = Parts(joints={f"{n}": f"{n - 1}" if n else None for n in range(count)}, width=8, token_width=8, blocks=1)
+    assert network._steps == 23 and torch.equal(network.hangs_on, chain)
+    assert torch.equal(parts._weights(logits[None], drawn, chain, network._steps)[0].argmax(1), part)
+    assert not torch.equal(parts._weights(logits[None], drawn, chain, 3)[0].argmax(1), part), "not in fewer steps"
 
 
 def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -> None:
@@ -333,9 +348,9 @@ def test_which_part_is_near_does_not_depend_on_how_finely_the_mesh_is_meshed() -
     torch.testing.assert_close(parts._weights(logits[None], drawn, ALL)[0], logits.softmax(1), rtol=0, atol=1e-4)
 
 
-def test_a_part_hangs_on_itself_on_its_parent_and_on_that_ones() -> None:
-    expected = [[1, 1, 1, 0], [0, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]]
-    assert holders([0, 0, 1, 2]).tolist() == expected
+def test_a_part_hangs_on_itself_and_on_its_parent() -> None:
+    expected = [[1, 1, 0, 1], [0, 1, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    assert hanging_on([0, 0, 1, 0]).tolist() == expected
 
 
 def test_a_part_too_large_to_lie_near_anything_holds_what_hangs_on_it() -> None:
@@ -344,7 +359,7 @@ def test_a_part_too_large_to_lie_near_anything_holds_what_hangs_on_it() -> None:
     head = vertices[0, :, 0].lt(-0.7) & torch.arange(len(mesh.vertices)).lt(len(mesh.vertices) // 2)
     logits = 4 * torch.eye(2)[head.long()]
     drawn = sample(vertices, surface_of(mesh.vertices, edges_of(mesh.faces)))
-    weights = parts._weights(logits[None], drawn, holders([0, 0]))[0]
+    weights = parts._weights(logits[None], drawn, hanging_on([0, 0]))[0]
     assert torch.equal(weights.argmax(1), head.long())
     assert weights[head, 0].gt(0).any(), "the trunk holds itself at the neck"
 
@@ -374,8 +389,8 @@ def test_targets_and_projections_are_posed_by_parts_that_are_near(monkeypatch: p
     drawn = sample(vertices, surface)
     asked = list[Sample]()
 
-    def weights_of(logits: torch.Tensor, drawn: Sample, holders: torch.Tensor) -> torch.Tensor:
-        assert holders is network.holders
+    def weights_of(logits: torch.Tensor, drawn: Sample, hangs_on: torch.Tensor, steps: int) -> torch.Tensor:
+        assert hangs_on is network.hangs_on and steps == 8
         asked.append(drawn)
         return torch.zeros_like(logits)
 
