@@ -517,10 +517,10 @@ def _near_parts(logits: Tensor, surface: Surface, masses: Tensor, hangs_on: Tens
     A few vertices of a back that are taken for an upper arm's would fly away with it, and so would a left hand that
     lies in the right one and is taken for it, wrist and all, but at an elbow that is the left one's. So a part is
     followed where it hangs on the root: the root itself does, and near where a part does, along the surface, more of it
-    does, and what hangs on it in the skeleton. How much of a part is near is told by the masses of the sample [b, k],
-    however finely the mesh is meshed there. Where nothing that is near hangs so, all that is near may be followed, and
-    where nothing is near, all. Where a mesh is of several pieces, each of which is near to all of the others, whatever
-    there is hangs on the root.
+    does, and what hangs on it in the skeleton (`hanging_on`), from place to place in so many steps. How much of a part
+    is near is told by the masses of the sample [b, k], however finely the mesh is meshed there. Where nothing that is
+    near hangs so, all that is near may be followed, and where nothing is near, all. Where a mesh is of several pieces,
+    each of which is near to all of the others, whatever there is hangs on the root.
     """
     shares = logits.softmax(2) * masses[..., None]
     beside = surface.near.to(shares.dtype)
